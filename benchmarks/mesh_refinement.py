@@ -8,10 +8,12 @@ quarter of it, linear elastic, Poisson's ratio 0.3. Its force on meshes refined 
 error (``corrected``), and on uniform ones. The reference is extrapolated from the last four adaptive meshes, without correction. Processor
 time, that of all coarser meshes and of the estimates included; equilibria of coarser meshes are initial guesses.
 
+``uniform``: the same force on uniform meshes of other numbers of cubes.
+
 ``dynamics``: the cuboid of the report's chapter 4.2 with neo-Hookean elements, bent by a force for 40 ms and released; implicit steps. Its
 corner path on 1000 nodes (9 x 9 x 9 cubes), and on a mesh that begins with 125 and follows the error of the stress.
 
-Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=1 python benchmarks/mesh_refinement.py [rate] [indentation] [dynamics]``.
+Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=1 python benchmarks/mesh_refinement.py [rate] [indentation] [uniform] [dynamics]``.
 """
 
 from __future__ import annotations
@@ -34,6 +36,7 @@ from naibu.simulation.adaptive.statics import StaticResult, StaticSolve, hyperel
 
 MARKED, REPEATS = 1000, 7
 RADIUS_MM, DEPTH_MM, HEIGHT_MM = 20.0, 2.0, 50.0
+UNIFORM_CUBES = (18, 20, 21, 22, 24, 27)
 SIDE_MM, FORCE_MN, DENSITY, STEP_S, STEPS, TRIAL_STEPS = 100.0, 6e3, 1e-7, 2e-3, 40, 2
 
 
@@ -93,7 +96,8 @@ def forces(solve_on: StaticSolve, n: int, limit: int, **settings: float) -> tupl
     return np.array(found.unknowns, dtype=float), plain, corrected, np.array(times)
 
 
-def indentation(limit: int = 20_000, uniform_limit: int = 100_000) -> None:
+def pressing() -> StaticSolve:
+    """Return what solves the indentation on a mesh, compiled."""
     law = material("linear_elastic", young_modulus=10.0, poisson_ratio=0.3)
     planes = tuple((lambda p, axis=axis: p[:, axis] < 1e-9, axis) for axis in range(2))
     sphere = spherical_indenter((0.0, 0.0, HEIGHT_MM + RADIUS_MM), RADIUS_MM)
@@ -101,6 +105,23 @@ def indentation(limit: int = 20_000, uniform_limit: int = 100_000) -> None:
     held = Conditions(lambda p: p[:, 2] < 1e-9, rollers=planes)
     solve_on = hyperelastic_static(held, [law], contacts=contacts, goal="force")
     solve_on(block(4), None)
+    return solve_on
+
+
+def uniform() -> None:
+    solve_on = pressing()
+    print("uniform meshes, each solved by itself")
+    print(f"{'cubes':>6s} {'unknowns':>9s} {'force, N':>9s} {'corrected, N':>13s} {'time, s':>8s}")
+    for n in UNIFORM_CUBES:
+        began = time.process_time()
+        found = solve_on(block(n), None)
+        spent = time.process_time() - began
+        plain, corrected = (-4.0 * f[2] / 1e3 for f in (found.reactions["indenter 0"], found.corrected_force("indenter 0")))
+        print(f"{n:6d} {found.displacement.size:9d} {plain:9.4f} {corrected:13.4f} {spent:8.1f}", flush=True)
+
+
+def indentation(limit: int = 20_000, uniform_limit: int = 100_000) -> None:
+    solve_on = pressing()
     adaptive = forces(solve_on, 4, limit, fraction=0.6)
     uniform = forces(solve_on, 9, uniform_limit, fraction=1.0, bisections=3)
     reference = np.polyfit(adaptive[0][-4:] ** (-2.0 / 3.0), adaptive[1][-4:], 1)[1]
@@ -168,6 +189,6 @@ def dynamics() -> None:
 
 
 if __name__ == "__main__":
-    parts = {"rate": rate, "indentation": indentation, "dynamics": dynamics}
+    parts = {"rate": rate, "indentation": indentation, "uniform": uniform, "dynamics": dynamics}
     for chosen in sys.argv[1:] or parts:
         parts[chosen]()
