@@ -1,7 +1,7 @@
 // The 3-D view of a running simulation: coloured surface, section, markers, tool, fixtures, and picking.
 import {
   BufferAttribute, BufferGeometry, DataTexture, DirectionalLight, DoubleSide, DynamicDrawUsage, FrontSide, HemisphereLight, InstancedMesh,
-  LinearFilter, Matrix4, Mesh, MeshBasicMaterial, Plane, Raycaster, Scene, ShaderMaterial, Sphere, SphereGeometry,
+  LinearFilter, Matrix4, Mesh, MeshBasicMaterial, Plane, Quaternion, Raycaster, Scene, ShaderMaterial, Sphere, SphereGeometry,
   Vector2, Vector3,
 } from "three";
 import { gridLines } from "./body.js";
@@ -9,7 +9,7 @@ import { CutOutline } from "./cut-outline.js";
 import { coarserSurface } from "./coarser-surface.js";
 import { colourTable, niceCeiling } from "./colormap.js";
 import { Detail, STILL_MS, STILL_RATIO } from "./detail.js";
-import { FRAGMENT, rigidBody, VERTEX } from "./motion.js";
+import { cornersOf, FRAGMENT, rigidBody, VERTEX } from "./motion.js";
 import { section } from "./section.js";
 import { readTheme, View } from "./view.js";
 
@@ -82,6 +82,24 @@ export class LiveView extends View {
     const above = [...this.high];
     above[2] += 0.35 * (this.high[2] - this.low[2]); // room for the tool
     this.frameful = [[0, 1, 2, 3, 4, 5, 6, 7].flatMap((k) => [0, 1, 2].map((a) => ((k >> a) & 1 ? above[a] : this.low[a])))];
+    if (this.waiting) this.frameful.push(...this.waiting);
+  }
+
+  /** Make room in the frame for the tools where the first one waits. */
+  #makeRoom({ centre, rotation, tool }) {
+    const turned = new Quaternion(...rotation);
+    const about = new Vector3(...centre);
+    this.waiting = this.scene.tools.map((shape, k) => {
+      const corners = cornersOf(shape, [0, 0, 0]);
+      const at = [];
+      for (let i = 0; i < corners.length; i += 3) {
+        const p = new Vector3().fromArray(corners, i);
+        at.push(...(k === tool ? p.applyQuaternion(turned) : p).add(about).toArray());
+      }
+      return at;
+    });
+    this.frameful.push(...this.waiting);
+    this.look("oblique");
   }
 
   #coloured(position, level) {
@@ -117,6 +135,7 @@ export class LiveView extends View {
     const ball = new SphereGeometry(MARKER_FRACTION * this.extent.radius, 10, 8);
     const mesh = new InstancedMesh(ball, new MeshBasicMaterial(), Math.max(count, 1));
     mesh.count = count;
+    mesh.renderOrder = 2; // behind the tool
     mesh.frustumCulled = false;
     mesh.visible = false;
     return mesh;
@@ -138,6 +157,7 @@ export class LiveView extends View {
   /** Show a frame, at once; the surface is coloured by displacement, or by the values of the frame if it has some. */
   setFrame(frame) {
     this.frame = frame;
+    if (!this.waiting && frame.tool >= 0) this.#makeRoom(frame);
     if (!this.#changed(frame)) return;
     this.drawn = frame;
     this.position.array = frame.positions; // that of the message, not a copy
@@ -242,10 +262,14 @@ export class LiveView extends View {
     const { nodes, weights, each } = this.scene.markers;
     const at = this.position.array;
     const matrix = new Matrix4();
+    // a section is opaque: those within half their mean distance of it are seen on it, on either side
+    const box = this.high.map((v, a) => v - this.low[a]);
+    const slab = 0.5 * Math.cbrt((box[0] * box[1] * box[2]) / Math.max(this.markers.count, 1));
+    this.markers.material.depthTest = !this.clip;
     for (let q = 0; q < this.markers.count; q += 1) {
       const p = [0, 0, 0];
       for (let k = q * each; k < (q + 1) * each; k += 1) for (let a = 0; a < 3; a += 1) p[a] += weights[k] * at[3 * nodes[k] + a];
-      const hidden = this.clip && this.clip.normal.x * p[0] + this.clip.normal.y * p[1] + this.clip.normal.z * p[2] + this.clip.constant < 0;
+      const hidden = this.clip && Math.abs(this.clip.normal.x * p[0] + this.clip.normal.y * p[1] + this.clip.normal.z * p[2] + this.clip.constant) > slab;
       this.markers.setMatrixAt(q, hidden ? matrix.makeScale(0, 0, 0) : matrix.makeTranslation(...p));
     }
     this.markers.instanceMatrix.needsUpdate = true;

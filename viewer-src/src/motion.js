@@ -55,7 +55,7 @@ function shapeOf({ kind, size }) {
 }
 
 /** Corners of a box around a rigid body at a position, as a flat list. */
-function cornersOf({ kind, size, axes }, position) {
+export function cornersOf({ kind, size, axes }, position) {
   const half = { box: size, sphere: [size[0], size[0], size[0]], cylinder: [size[0], size[0], size[1]], capsule: [size[0], size[0], size[0] + size[1]] }[kind];
   const out = [];
   for (let corner = 0; corner < 8; corner += 1) {

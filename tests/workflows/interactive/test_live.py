@@ -178,6 +178,34 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
         assert page.console == []
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_markers_are_seen_in_a_section_and_the_tool_that_waits_is_seen_whole(tmp_path: Path) -> None:
+    body = touched_lattice()
+    inner = np.flatnonzero((np.abs(body.points - body.points.mean(axis=0)) < 0.45 * np.ptp(body.points, axis=0)).all(axis=1))
+    model = TouchableModel("Cube", (), body, "mean elongation, %", np.repeat(inner[:, None], 2, axis=1), np.full((len(inner), 2), 0.5))
+    with served(model) as (address, _), opened_browser(800, 700) as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        farthest = page.value(
+            "(() => { const { view, frame } = naibuLive; const tool = view.tools[frame.tool]; tool.updateMatrixWorld(true);"
+            " const at = tool.children[0].geometry.attributes.position; const p = view.camera.position.clone(); let most = 0;"
+            " for (let i = 0; i < at.count; i += 1) { p.fromBufferAttribute(at, i).applyMatrix4(tool.matrixWorld).project(view.camera);"
+            " most = Math.max(most, Math.abs(p.x), Math.abs(p.y)); } return most; })()"
+        )
+        assert 0.0 < farthest < 1.0  # of half the picture
+        page.value("naibuLive.take(''); naibuLive.view.setMarkers(true)")
+        page.wait("naibuLive.frame.tool < 0")
+        seen = []
+        for clip in ("null", "1, 0.5", "1, 0.02"):
+            page.value(f"naibuLive.view.setClip({clip}); naibuLive.view.renderFinest()")
+            page.wait("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+            shown = imread(page.picture(tmp_path / "section.png"))[..., :3]
+            seen.append(int(((shown[..., 0] > 0.6) & (shown[..., 1] < 0.5) & (shown[..., 2] < 0.2)).sum()))
+        assert seen[0] == 0  # within an opaque body
+        assert seen[1] > 30
+        assert seen[2] == 0  # none lies so near to the side of the cube
+
+
 def test_markers_come_back_when_a_cut_is_undone() -> None:
     body = touched_lattice()
     model = TouchableModel("Cube", (), body, "mean elongation, %", np.array([[0, 1]]), np.array([[0.5, 0.5]]))
