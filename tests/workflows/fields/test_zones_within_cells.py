@@ -86,7 +86,7 @@ def test_intervals_hold_the_moduli_of_a_skin_thinner_than_cubes(tmp_path: Path, 
 def test_a_layer_of_one_cell_is_told_and_its_interval_is_wide(tmp_path: Path) -> None:
     """Noise of 0.2 mm leaves the shear modulus of the skin to a third; half the size of cells changes it by a third as well."""
     found = identified(tmp_path, 6, sd_mm=0.2).estimate
-    assert found.budget is not None and found.budget.noise[1] < 0.5 and (found.budget.mesh[:2] >= 0.24).all()
+    assert found.budget is not None and found.budget.noise[1] < 0.5 and (found.budget.mesh[:2] > 0.35).all()
     assert "One element thick in a large part: " in " ".join(found.identifiability)
     for (low, high), name in zip(found.intervals()[0], ("core", "skin"), strict=True):
         assert low < TRUTH[name][0] < high
@@ -167,7 +167,7 @@ def test_the_doubt_of_zones_within_cells_is_the_whole_change() -> None:
     np.testing.assert_allclose(doubt_of(shift)[0], [0.04, 0.02])
     np.testing.assert_allclose(doubt_of(shift, mixed=True)[1], np.diag([0.01, 0.0025]))
     np.testing.assert_allclose(doubt_of(3.0 * shift, mixed=True)[0], [0.3, 0.3])
-    np.testing.assert_allclose(doubt_of(np.zeros(4), mixed=True, thin=np.array([False, True]))[0], [0.25, 0.5, 0.25, 0.5])
+    np.testing.assert_allclose(doubt_of(np.zeros(4), mixed=True, thin=np.array([False, True]))[0], np.array([0.5, 1.5, 0.5, 1.5]) / 1.4)
 
 
 def test_cubes_that_do_not_show_a_zone_are_refused_or_made_smaller() -> None:

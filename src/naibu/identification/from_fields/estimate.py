@@ -75,7 +75,7 @@ from naibu.identification.verdict import Explanation
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
 TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones."
-ONE_CELL_THICK = "One element thick in a large part: {}. Moduli may be wrong by a third, theirs by more, as intervals say."
+ONE_CELL_THICK = "One element thick in a large part: {}. Moduli may be wrong by a third, theirs several times: see intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
 AT_BOUND = 3.7  # standard deviation of ln(kappa / mu) where it is at its bound: half of the way down to that of a Poisson's ratio of 0

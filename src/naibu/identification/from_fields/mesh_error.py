@@ -29,7 +29,8 @@ DOUBT = (
     0.4  # standard deviation of that error over the change: orders from 1 to 2.5 give 2 to 1.2 for it; also what is left on the finer mesh
 )
 COARSE = 0.25  # change of a logarithm from which extrapolation is not trusted: then every modulus gets the doubt of the worst
-THIN = 0.35  # as large a change is reckoned with where a zone is one cell thick, which the change to half the size does not tell
+THIN = 0.5  # as large a change is reckoned with where a zone is one cell thick, which the change to half the size does not tell
+ITSELF = 3.0  # times as much for the moduli of that zone: skins of virtual legs came out up to 3.7 times too soft
 ONE_CELL = 0.25  # part of the cells of a zone that lie between others on opposite sides, from which it is called one cell thick
 MOST_UNKNOWNS = 600_000  # of the finer mesh
 ModuliOn = Callable[[Mesh, Zones], tuple[FloatArray, FloatArray]]  # lambda and mu, kPa, of the cells of a mesh
@@ -107,14 +108,15 @@ def doubt_of(shift: FloatArray, *, mixed: bool = False, thin: BoolArray | None =
     Those of ln(kappa / mu) are relative to mu / kappa on the mesh (see `relative_change` and `stretch_of`).
     The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left. Where zones
     end inside of cells (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size. If regions
-    are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than twice as much.
+    are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than `ITSELF` times as
+    much.
     """
     worst = max(float(np.abs(shift).max(initial=0.0)), 0.0 if thin is None else THIN)
     part = 1.0 if mixed else DOUBT
     if worst > COARSE:
         sd = np.full_like(shift, part / EXTRAPOLATED * worst)
         if thin is not None:
-            sd = np.maximum(sd, part / EXTRAPOLATED * THIN * np.tile(1.0 + thin, 2))
+            sd = np.maximum(sd, part / EXTRAPOLATED * THIN * np.tile(np.where(thin, ITSELF, 1.0), 2))
         return sd, np.diag(sd**2)
     sd = part / EXTRAPOLATED * np.abs(shift)
     return sd, np.diag(sd**2) if mixed else (part / EXTRAPOLATED) ** 2 * np.outer(shift, shift)
