@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.interpolate import RBFInterpolator
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
@@ -28,11 +27,9 @@ from naibu.mechanics.linear_algebra.direct import direct_solver, pardiso_library
 from naibu.mechanics.linear_algebra.protocols import Factorization, LinearSolver
 from naibu.mechanics.linear_algebra.solver_selection import DIRECT_LIMIT, SolverName, choose_solver
 from naibu.meshing.point_location import interpolation_operator
-from naibu.meshing.surface import boundary_nodes
 
 EXACT = 1e-3  # standard deviation ascribed to data that are called exact, as a fraction of the largest displacement: models are not exact
-SURFACE_STRAIN = 0.2  # standard deviation of strain that measurements nearby do not show: constrains nodes near which nothing was measured
-NEARBY = 30  # measurements from which the displacement of a loaded node is guessed
+SURFACE_STRAIN = 0.2  # standard deviation of the strain along loaded nodes: constrains those near which nothing was measured
 NEWTON_TOLERANCE = 1e-9  # residual force over the force on the loaded nodes
 NEWTON_ITERATIONS = 12
 HALVINGS = 6
@@ -61,9 +58,6 @@ class Observed:
         From the sought displacements to those of all loaded components.
     prior : csr_matrix, shape (n_b, n_b)
         Inverse covariance of the weak prior on the sought displacements, 1/mm^2.
-    expected : ndarray, shape (n_b,)
-        Its mean, mm: where forces act on the whole surface, what measurements nearby show, since it may bend sharply. Where they act on
-        parts of it, these are plates, which do not strain: 0, differences of which are those of a motion without strain.
     noise_mm : float
         Root mean square standard deviation of a component, mm.
     exact : bool
@@ -77,7 +71,6 @@ class Observed:
     unknown: IntArray
     basis: sp.csr_matrix
     prior: sp.csr_matrix
-    expected: FloatArray
     noise_mm: float
     exact: bool
 
@@ -105,18 +98,11 @@ class Observed:
             load_case = finer.load_case(load_case)
             loaded = np.flatnonzero(load_case.loaded.ravel()).astype(np.int64)
             basis = sp.kron(finer.parents, sp.identity(d), format="csr")[loaded][:, unknown]
-        expected = np.zeros(len(unknown))
-        if d == 3 and load_case.loaded[boundary_nodes(mesh)].all():
-            expected = _smoothed_at(field.points[valid], field.vectors[valid], mesh.points).ravel()[unknown]
-        return cls(load_case, operator, data, loaded, unknown, basis, _surface_prior(mesh, unknown), expected, noise, exact)
+        return cls(load_case, operator, data, loaded, unknown, basis, _surface_prior(mesh, unknown), noise, exact)
 
     def sought(self, u: FloatArray) -> FloatArray:
         """Return the sought displacements (n_b,), mm, among the displacement (n, d) of all nodes."""
         return u.ravel()[self.unknown]
-
-    def beyond_expected(self, u: FloatArray) -> FloatArray:
-        """Return by how much (n_b,), mm, the sought displacements among those of all nodes (n, d) differ from the mean of their prior."""
-        return self.sought(u) - self.expected
 
     @property
     def points(self) -> FloatArray:
@@ -152,18 +138,6 @@ def _at_nodes(mesh: Mesh, points: FloatArray, name: str) -> sp.csr_matrix:
     if distance.min(axis=1).max() > 1e-9 * float(np.ptp(mesh.points)):
         raise InputError(f"load case {name!r}: in {mesh.dimension} dimensions fields are measured at nodes of the mesh")
     return sp.csr_matrix((np.ones(len(points)), (np.arange(len(points)), node)), shape=(len(points), mesh.n_points))
-
-
-def _smoothed_at(points: FloatArray, vectors: FloatArray, where: FloatArray) -> FloatArray:
-    """Return the measured displacement (k, d), mm, near points `where` (k, d): an affine motion, and smooth deviations from it."""
-    centre, extent = points.mean(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-300)
-    linear = [np.column_stack([np.ones(len(p)), (p - centre) / extent]) for p in (points, where)]
-    affine = np.linalg.lstsq(linear[0], vectors, rcond=1e-9)[0]
-    spacing = (np.prod(np.ptp(points, axis=0) / extent + 1e-3) / len(points)) ** (1.0 / points.shape[1])
-    near = RBFInterpolator(
-        (points - centre) / extent, vectors - linear[0] @ affine, neighbors=min(NEARBY, len(points)), smoothing=spacing, kernel="linear"
-    )
-    return np.asarray(linear[1] @ affine + near((where - centre) / extent))
 
 
 def _surface_prior(mesh: Mesh, loaded: IntArray) -> sp.csr_matrix:

@@ -145,7 +145,7 @@ class FieldModel:
             raise ConvergenceError("moduli are beyond all bounds")
         states, factors = self._states(lame, shear, guesses)
         misfit = sum(float(np.sum(o.residual(u) ** 2)) for o, u in zip(self.observed, states, strict=True))
-        loaded = [o.beyond_expected(u) for o, u in zip(self.observed, states, strict=True)]
+        loaded = [o.sought(u) for o, u in zip(self.observed, states, strict=True)]
         prior = sum(float(b @ (o.prior @ b)) for o, b in zip(self.observed, loaded, strict=True))
         return Point(theta, tuple(states), tuple(factors), misfit, prior)
 
@@ -285,7 +285,7 @@ class Linearised:
         """Return the gradient if the whitened residuals (q,) of the load cases were these."""
         observed = self.model.observed
         theta, loaded = self.adjoint([(o.operator.T @ r)[:, None] for o, r in zip(observed, residuals, strict=True)])
-        prior = [o.prior @ o.beyond_expected(u) for o, u in zip(observed, self.point.states, strict=True)]
+        prior = [o.prior @ o.sought(u) for o, u in zip(observed, self.point.states, strict=True)]
         return theta[:, 0], [b[:, 0] + p for b, p in zip(loaded, prior, strict=True)]
 
     def product(self, theta: FloatArray, loaded: Sequence[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
