@@ -28,7 +28,7 @@ EXTRAPOLATED = 1.4  # whole error over the change to half the element size: 1 / 
 DOUBT = (
     0.4  # standard deviation of that error over the change: orders from 1 to 2.5 give 2 to 1.2 for it; also what is left on the finer mesh
 )
-DOUBT_OF_RATIO = 1.0  # the same of mu / kappa: it feels most what flat faces cost a curved body, which half the size does not show
+DOUBT_OF_RATIO = 0.9  # the same of mu / kappa: it feels most what flat faces cost a curved body, which half the size does not show
 COARSE = 0.25  # change of a logarithm from which extrapolation is not trusted: then every modulus gets the doubt of the worst
 THIN = 0.5  # as large a change is reckoned with where a zone is one cell thick, which the change to half the size does not tell
 ITSELF = 3.0  # times as much for the moduli of that zone: skins of virtual legs came out several times too soft
@@ -119,7 +119,7 @@ def doubt_of(shift: FloatArray, *, mixed: bool = False, thin: BoolArray | None =
         if thin is not None:
             sd = np.maximum(sd, part / EXTRAPOLATED * THIN * np.tile(np.where(thin, ITSELF, 1.0), 2))
         return sd, np.diag(sd**2)
-    signed = np.repeat([part, DOUBT_OF_RATIO], len(shift) // 2) / EXTRAPOLATED * shift
+    signed = np.repeat([part, max(part, DOUBT_OF_RATIO)], len(shift) // 2) / EXTRAPOLATED * shift
     return np.abs(signed), np.diag(signed**2) if mixed else np.outer(signed, signed)
 
 
