@@ -10,6 +10,7 @@ from .specimens.hand import hand_surface
 from .specimens.lattice_twin import Twin, dough_lattice, dough_parameters, dough_twin, virtual_capture
 from .specimens.marker_phantoms import Phantom, Scanner, VirtualSpecimen, box_experiment, phantom, two_gels, virtual_specimen
 from .specimens.quadratic_body import QuadraticBody
+from .specimens.scanned_leg import LegShape, ScannedLeg, scanned_leg
 from .specimens.scanned_liver import ScannedLiver, scanned_liver
 from .specimens.specimen_matching import BlockMatch, block_match
 from .specimens.textured_sphere import ScannedBall, squeezed_ball
@@ -19,6 +20,7 @@ __all__ = [
     "CTDevice",
     "FormulaMotion",
     "HomogeneousState",
+    "LegShape",
     "MRDevice",
     "MarkerKind",
     "MatchedMotion",
@@ -27,6 +29,7 @@ __all__ = [
     "PosedMotion",
     "QuadraticBody",
     "ScannedBall",
+    "ScannedLeg",
     "ScannedLiver",
     "Scanner",
     "Scatterers",
@@ -55,6 +58,7 @@ __all__ = [
     "rescanned",
     "residual_strain",
     "scan",
+    "scanned_leg",
     "scanned_liver",
     "scanned_states",
     "simple_shear",

@@ -50,6 +50,7 @@ from naibu.identification.from_fields.mesh_error import (
     changes_on_finer_mesh,
     doubt_of,
     extrapolated,
+    one_cell_thick,
     refitted,
     relative_change,
     stretch_of,
@@ -74,6 +75,7 @@ from naibu.identification.verdict import Explanation
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
 TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones."
+ONE_CELL_THICK = "One element thick in a large part: {}. Moduli may be wrong by a third, theirs several times: see intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
 AT_BOUND = 3.7  # standard deviation of ln(kappa / mu) where it is at its bound: half of the way down to that of a Poisson's ratio of 0
@@ -362,11 +364,17 @@ class _Recipe:
         others = assumptions(at, quadratic, self.law)
         of_known = covariance_of(others, len(theta)) * np.outer(stretch, stretch)
         of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
+        thin = () if self.region_at is None or corrected is not None else one_cell_thick(model.mesh)
         if shift is not None:
             relative = shift if corrected is not None else relative_change(shift)
-            of_mesh, covariance = doubt_of(relative, mixed=self.region_at is not None) if corrected is None else corrected.doubt
+            if corrected is None:
+                mixed = self.region_at is not None
+                of_zones = np.isin(model.zones.names, thin) if thin else None
+                of_mesh, covariance = doubt_of(relative, mixed=mixed, thin=of_zones)
+            else:
+                of_mesh, covariance = corrected.doubt
             of_mesh, total = of_mesh * stretch, total.with_added(covariance * np.outer(stretch, stretch))
-            coarse = float(np.abs(relative).max()) > COARSE if corrected is None else not corrected.converged
+            coarse = bool(thin) or float(np.abs(relative).max()) > COARSE if corrected is None else not corrected.converged
         total = total.with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         judged = verdict(model.observed, residuals, freedom)
         if self.region_at is not None and shift is not None:
@@ -377,7 +385,7 @@ class _Recipe:
         how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
         words = (judged.sentence, *judged.notes, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
         if coarse:
-            words = (words[0], TOO_COARSE, *words[1:])
+            words = (words[0], TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1]), *words[1:])
         states = tuple(u[: model.mesh.n_points] for u in point.states)
         return FieldEstimate(
             model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import LawName, computed_mesh, field_law
@@ -28,7 +28,11 @@ EXTRAPOLATED = 1.4  # whole error over the change to half the element size: 1 / 
 DOUBT = (
     0.4  # standard deviation of that error over the change: orders from 1 to 2.5 give 2 to 1.2 for it; also what is left on the finer mesh
 )
+DOUBT_OF_RATIO = 0.9  # the same of mu / kappa: it feels most what flat faces cost a curved body, which half the size does not show
 COARSE = 0.25  # change of a logarithm from which extrapolation is not trusted: then every modulus gets the doubt of the worst
+THIN = 0.5  # as large a change is reckoned with where a zone is one cell thick, which the change to half the size does not tell
+ITSELF = 3.0  # times as much for the moduli of that zone: skins of virtual legs came out several times too soft
+ONE_CELL = 0.25  # part of the cells of a zone that lie between others on opposite sides, from which it is called one cell thick
 MOST_UNKNOWNS = 600_000  # of the finer mesh
 ModuliOn = Callable[[Mesh, Zones], tuple[FloatArray, FloatArray]]  # lambda and mu, kPa, of the cells of a mesh
 
@@ -80,20 +84,43 @@ def relative_change(shift: FloatArray) -> FloatArray:
     return np.concatenate([shift[:k], -np.expm1(-shift[k:])])
 
 
-def doubt_of(shift: FloatArray, *, mixed: bool = False) -> tuple[FloatArray, FloatArray]:
+def one_cell_thick(mesh: Mesh) -> tuple[str, ...]:
+    """Return the names of regions that are one hexahedron thick in a large part, from one side or another.
+
+    The displacement in them is linear from border to border; a layer under a surface with unknown forces then bends and shears otherwise
+    than it does, and half the size, with the surface as on the mesh, hardly shows it.
+    """
+    faces = np.array([[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [3, 2, 6, 7], [0, 1, 2, 3], [4, 5, 6, 7]])  # opposite ones in pairs
+    _, number = np.unique(np.sort(mesh.cells[:, faces].reshape(-1, 4), axis=1), axis=0, return_inverse=True)
+    number = number.ravel()
+    region = np.repeat(mesh.regions, 6)
+    total, squares = np.bincount(number, region), np.bincount(number, region.astype(float) ** 2)
+    count = np.bincount(number)
+    between = (count == 1) | (squares * count != total**2)  # at the surface, or of two regions
+    alone = between[number].reshape(-1, 3, 2).all(axis=2).any(axis=1)
+    k = len(mesh.region_names)
+    share = np.bincount(mesh.regions, alone, k) / np.maximum(np.bincount(mesh.regions, minlength=k), 1)
+    return tuple(name for name, part in zip(mesh.region_names, share, strict=True) if part > ONE_CELL)
+
+
+def doubt_of(shift: FloatArray, *, mixed: bool = False, thin: BoolArray | None = None) -> tuple[FloatArray, FloatArray]:
     """Return standard deviations (2 count,) and covariance (2 count, 2 count) of extrapolated logarithms that changed by `shift`.
 
     Those of ln(kappa / mu) are relative to mu / kappa on the mesh (see `relative_change` and `stretch_of`).
     The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left. Where zones
-    end inside of cells (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size.
+    end inside of cells (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size. If regions
+    are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than `ITSELF` times as
+    much.
     """
-    worst = float(np.abs(shift).max(initial=0.0))
+    worst = max(float(np.abs(shift).max(initial=0.0)), 0.0 if thin is None else THIN)
     part = 1.0 if mixed else DOUBT
     if worst > COARSE:
         sd = np.full_like(shift, part / EXTRAPOLATED * worst)
+        if thin is not None:
+            sd = np.maximum(sd, part / EXTRAPOLATED * THIN * np.tile(np.where(thin, ITSELF, 1.0), 2))
         return sd, np.diag(sd**2)
-    sd = part / EXTRAPOLATED * np.abs(shift)
-    return sd, np.diag(sd**2) if mixed else (part / EXTRAPOLATED) ** 2 * np.outer(shift, shift)
+    signed = np.repeat([part, max(part, DOUBT_OF_RATIO)], len(shift) // 2) / EXTRAPOLATED * shift
+    return np.abs(signed), np.diag(signed**2) if mixed else np.outer(signed, signed)
 
 
 def refitted(

@@ -175,8 +175,9 @@ def _flatness(points: FloatArray) -> FloatArray:
 
 def _cells_of_voxels(fitted: Mesh, before: Mesh, cell_of_voxel: IntArray, inside: Volume) -> IntArray:
     """Return the cell of every voxel, found again where cells around it changed."""
-    changed = (np.abs(fitted.points - before.points) > 1e-9).any(axis=1)[before.cells].any(axis=1)
-    again = np.argwhere((cell_of_voxel >= 0) & np.append(changed, False)[cell_of_voxel])
+    moved: BoolArray = np.abs(fitted.points - before.points).max(axis=1) > 1e-9
+    changed = np.append(moved[before.cells].any(axis=1), False)  # the last one for voxels without a cell
+    again = np.argwhere(changed[cell_of_voxel])
     out = cell_of_voxel.copy()
     if len(again):
         found = locate(fitted, inside.to_physical(again[:, ::-1].astype(float)), tolerance_mm=np.inf)

@@ -35,7 +35,6 @@ from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.block_mesh import (
     BLURRED,
     CELLS,
@@ -48,6 +47,7 @@ from naibu.workflows.fields.block_mesh import (
     regions_of,
     sizes_of_voxels,
 )
+from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.known_zones import parse_known_zones
 from naibu.workflows.fields.measured_load_case import doubts_of_scale, measured_load_case, relative_deformation
 from naibu.workflows.results.files_together import written_together

@@ -13,11 +13,15 @@ from naibu.identification.from_fields.forward.load_cases import KnownRegion, Zon
 from naibu.identification.from_fields.forward.sensitivities import logarithms
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
+RIGID = 30.0  # times the shear modulus of another known region: from here on a region counts as rigid, and is not mixed
 RegionAt = Callable[[FloatArray], IntArray]  # number of the region of the mesh at points (k, d), mm; negative outside of the body
 
 
 def parts_within_cells(mesh: Mesh, zones: Zones, region_at: RegionAt) -> sp.csr_matrix:
     """Return the part of every cell in each zone, and then in each known region, (m, zones + known regions).
+
+    A region that is as good as rigid has cells for the most part within it wholly and no others: in proportion it would stiffen cells far
+    around, as mixtures of rigid and soft parts are as soft as the latter until the former touch (:cite:p:`hill1965`).
 
     Parameters
     ----------
@@ -36,7 +40,20 @@ def parts_within_cells(mesh: Mesh, zones: Zones, region_at: RegionAt) -> sp.csr_
     columns = np.array([place[name] for name in mesh.region_names])[found]
     share = np.full(columns.size, 1.0 / columns.shape[1])
     rows = np.repeat(np.arange(mesh.n_cells), columns.shape[1])
-    return sp.csr_matrix((share, (rows, columns.ravel())), shape=(mesh.n_cells, len(place)))
+    parts = sp.csr_matrix((share, (rows, columns.ravel())), shape=(mesh.n_cells, len(place)))
+    shear = np.array([lame_parameters(region.young_modulus, region.poisson_ratio)[1] for region in zones.known])
+    rigid = zones.count + np.flatnonzero(shear > RIGID * shear.min(initial=np.inf))
+    return _without_rigid_mixtures(parts, rigid) if len(rigid) else parts
+
+
+def _without_rigid_mixtures(parts: sp.csr_matrix, rigid: IntArray) -> sp.csr_matrix:
+    """Return parts (m, k) in which each of the columns `rigid` has a cell wholly or not at all."""
+    out = parts.toarray()
+    for column in rigid:
+        whole = (out[:, column] > 0.5) | (out[:, column] >= out.sum(axis=1) - 1e-12)
+        out[whole] = 0.0
+        out[:, column] = whole
+    return sp.csr_matrix(out / out.sum(axis=1, keepdims=True))
 
 
 def logarithms_of_regions(theta: FloatArray, known: Sequence[KnownRegion]) -> FloatArray:
