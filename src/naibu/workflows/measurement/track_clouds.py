@@ -18,8 +18,8 @@ from naibu.core.arrays import FloatArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
+from naibu.imaging.markers.linking.local_kriging import KRIGED
 from naibu.imaging.markers.linking.particle_motion import ParticleMotion, particle_motion
-from naibu.imaging.markers.linking.point_clouds import NEIGHBOURS
 from naibu.io.displacement_fields import write_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
@@ -212,10 +212,11 @@ def _mask(points: FloatArray) -> Volume:
 
 def _section(names: Sequence[str], rows: tuple[tuple[str, Cell], ...], motion: ParticleMotion) -> Section:
     words = (
-        "Particles were linked by their arrangement and a motion that is nearly affine over a few particles. A link is trusted where its "
+        "Particles were linked by their arrangement and a motion that is continuous over a few particles. A link is trusted where its "
         "probability to be right, which errs on the low side, is at least one half; the others are not valid in the field.",
-        "Standard deviations follow from how far each displacement is from the motion of the particles around. The strain is that of the "
-        f"affine motion of the {NEIGHBOURS[motion.field.points.shape[1]]} nearest linked particles (Green-Lagrange).",
+        "Standard deviations follow from how far each displacement is from what the particles around predict. The strain "
+        f"(Green-Lagrange) is that of a motion through the {KRIGED[motion.field.points.shape[1]]} nearest linked particles, as rough as "
+        "the motion is found to be there (kriging); its standard deviation includes what the motion varies between them.",
     )
     table = Table(f"{names[0]} to {names[1]}", ("quantity", "value"), rows)
     return Section("Particles", words, (table,), (_displacement(motion), _strain(motion), _quality(motion)))

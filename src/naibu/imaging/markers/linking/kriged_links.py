@@ -46,7 +46,7 @@ def kriged_links(cloud: Cloud, state: State, how: LinkSettings) -> tuple[FloatAr
         known, values, linked = state.link >= 0, cloud.deformed[np.maximum(state.link, 0)], state.link.copy()
         process.update(some, near, values, known, noise)
         holes = np.flatnonzero(rougher)
-        process.roughen(holes, ROUGHER ** rougher[holes], near, values, noise)
+        process.roughen(holes, np.power(ROUGHER, rougher[holes], dtype=float), near, values, noise)
         if round_ == ROUNDS or not len(some):
             break
         focus = np.arange(n) if round_ < WHOLE else np.union1d(_beside(some, near, n), holes)
@@ -58,7 +58,8 @@ def kriged_links(cloud: Cloud, state: State, how: LinkSettings) -> tuple[FloatAr
         noise[focus] = weight
         free = np.ones(len(cloud.deformed), dtype=bool)
         free[state.link[known]] = False
-        distance, proposal = tree.query(process.predicted[focus], workers=-1)
+        nearest = tree.query(process.predicted[focus], workers=-1)
+        distance, proposal = np.asarray(nearest[0]), np.asarray(nearest[1], dtype=np.int64)
         alone[focus] = fraction_around(cloud.deformed, free, process.predicted[focus], tree)
         rougher = np.where(~known & (alone > HOLE[0] * free.mean() + HOLE[1]), np.minimum(rougher + 1, RAISED), 0)
         limit = _limit(cloud, sd, alone[focus], focus, proposal, how)
@@ -66,15 +67,13 @@ def kriged_links(cloud: Cloud, state: State, how: LinkSettings) -> tuple[FloatAr
         state.owner[state.link[wrong]] = -1
         state.link[wrong], state.residual[wrong] = -1, np.inf
         state.residual[focus] = np.where(state.link[focus] >= 0, residual, np.inf)
-        proposal = np.where(distance <= limit, proposal, -1).astype(np.int64)
+        proposal[~(distance <= limit)] = -1
         settle(focus, proposal, distance, state.link, state.owner, state.residual, state.gradients[focus], state.gradients)
         others = state.link != linked
-        if round_ >= WHOLE and others.sum() <= STEADY * n and not (rougher[rougher > 0] < RAISED).any():
-            rougher[:] = 0
         near, anew = _renewed(cloud, state, near, linked, others)
         moved |= others
         some = np.arange(n) if round_ + 1 < WHOLE else np.flatnonzero(anew | moved | moved[near].any(axis=1))
-        if round_ >= WHOLE and others.sum() <= STEADY * n and not rougher.any():
+        if round_ >= WHOLE and others.sum() <= STEADY * n and not ((rougher > 0) & (rougher < RAISED)).any():
             process.update(some, near, cloud.deformed[np.maximum(state.link, 0)], state.link >= 0, noise)
             break
     return process.predicted, np.maximum(process.sd, LEAST * cloud.growth * cloud.reference_scale)
@@ -100,12 +99,12 @@ def _beside(some: IntArray, near: IntArray, n: int) -> IntArray:
 def _renewed(cloud: Cloud, state: State, near: IntArray, before: IntArray, others: BoolArray) -> tuple[IntArray, BoolArray]:
     """Return the neighbours after links have changed, and which points have others than before."""
     lost, gained = others & (state.link < 0), np.flatnonzero((before < 0) & (state.link >= 0))
-    anew = lost[near].any(axis=1)
+    anew: BoolArray = np.asarray(lost[near].any(axis=1))
     if len(gained):
         farthest = np.linalg.norm(cloud.reference[near[:, -1]] - cloud.reference, axis=1)
         tree = cKDTree(cloud.reference[gained])
-        distance, at = tree.query(cloud.reference, k=min(2, len(gained)), workers=-1)
-        distance, at = distance.reshape(len(near), -1), np.asarray(at).reshape(len(near), -1)
+        found = tree.query(cloud.reference, k=min(2, len(gained)), workers=-1)
+        distance, at = (np.asarray(part).reshape(len(near), -1) for part in found)
         anew |= ((distance <= farthest[:, None]) & (gained[at] != np.arange(len(near))[:, None])).any(axis=1)
     if anew.any():
         near = near.copy()

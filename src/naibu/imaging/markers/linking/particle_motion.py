@@ -38,9 +38,10 @@ class ParticleMotion:
     links : Links
         Pairs of particles, in the order of the field.
     gradient : ndarray, shape (k, d, d)
-        Displacement gradient ``du_a / dx_b`` of the affine motion of the particles around; NaN along the normal of particles in a plane.
+        Displacement gradient ``du_a / dx_b`` of the motion of the particles around, by kriging; NaN along the normal of particles in
+        a plane.
     gradient_sd : ndarray, shape (k, d, d)
-        Its standard deviation from the noise of the displacements around. What a strain varies within the neighbourhood is not part of it.
+        Its standard deviation, from the noise of the displacements around and what the motion varies between them.
     """
 
     field: DisplacementField
@@ -75,8 +76,7 @@ def particle_motion(
         Particles of the two states, mm, in any order, in two or three dimensions.
     reference_sd_mm, deformed_sd_mm : array_like, shape (n, d), (m, d), optional
         Standard deviations of their coordinates, mm. Without both, the covariance of the displacements follows from how far each is from
-        the affine motion of those around, which includes what the motion varies there: standard deviations are rather too large than too
-        small. With both, they are raised by a common factor where these residuals are larger.
+        what those around predict. With both, they are raised by a common factor where these residuals are larger.
     min_confidence : float
         Probability below which a link is not valid in the field, 0 to 1.
     seed, settings
