@@ -124,8 +124,12 @@ class LatticeCut:
                 parts.append(part.reshape(-1, *values.shape[1:]))
             return np.concatenate(parts)
 
+        # faces of the new surface begin with the thinnest foundation of their indenter, as no covered area has made it thicker
+        thickness = np.repeat(before.thickness.min(axis=1)[:, None], len(known), axis=1)
+        thickness[:, known] = before.thickness
         return replace(
-            before, first=np.concatenate([[0], np.cumsum(each * len(known))]).astype(np.int64), mode=carried(before.mode),
+            before, thickness=thickness,
+            first=np.concatenate([[0], np.cumsum(each * len(known))]).astype(np.int64), mode=carried(before.mode),
             touched=carried(before.touched), compression=carried(before.compression), extension=carried(before.extension),
             friction=carried(before.friction), multiplier=np.ascontiguousarray(before.multiplier[:, self.source]),
             acceleration=np.ascontiguousarray(before.acceleration[:, self.source]),

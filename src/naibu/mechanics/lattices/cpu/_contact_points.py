@@ -19,7 +19,7 @@ from naibu.mechanics.contact._geometry_kernels import MESH, SPHERE, distance_fro
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
-TANGENTIAL = 16.0  # stiffness of a point before it slips, of a foundation one element thick: the area in contact does not matter to it
+TANGENTIAL = 16.7  # stiffness of a point before it slips, of a foundation one element thick: the area in contact does not matter to it
 MARGIN = 0.25  # of the radius of a face, by which it may be off what was foreseen
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
