@@ -169,7 +169,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=list(PARTS), default=list(PARTS))
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--json", type=Path, help="write the tables to this file as well")
-    parser.add_argument("--record", action="store_true", help="write results/speed.json")
+    parser.add_argument("--record", action="store_true", help="write results/speed.json, or results/speed_PART.json of some parts")
     chosen = parser.parse_args()
     tables = []
     for name in chosen.only:
@@ -182,7 +182,7 @@ def main() -> None:
         told = {table.name: {"columns": table.columns, "rows": table.rows} for table in tables}
         chosen.json.write_text(json.dumps(told, default=float) + "\n", encoding="utf-8")
     if chosen.record:
-        write_record("speed", tables)
+        write_record("speed" if set(chosen.only) == set(PARTS) else f"speed_{'_'.join(chosen.only)}", tables)
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ from naibu.mechanics.lattices.model.surface import surface_faces
 from naibu.meshing.cutting._crossing_kernels import crossed_segments, distances
 from naibu.meshing.cutting.swept_blade import SweptBlade
 
-SPLINTER = 8  # cubes, which fill one of twice the edge, do not come loose merely because the face of a larger one is cut as a whole
+SPLINTER = 8  # finest cubes, less than which do not come loose merely because the face of a larger cube is cut as a whole
 _FIRST, _SECOND = np.triu_indices(8, 1)
 
 
@@ -131,7 +131,8 @@ class LatticeCut:
             before, thickness=thickness,
             first=np.concatenate([[0], np.cumsum(each * len(known))]).astype(np.int64), mode=carried(before.mode),
             touched=carried(before.touched), compression=carried(before.compression), extension=carried(before.extension),
-            friction=carried(before.friction), multiplier=np.ascontiguousarray(before.multiplier[:, self.source]),
+            friction=carried(before.friction), begun=carried(before.begun),
+            multiplier=np.ascontiguousarray(before.multiplier[:, self.source]),
             acceleration=np.ascontiguousarray(before.acceleration[:, self.source]),
         )  # fmt: skip
 
@@ -247,11 +248,11 @@ def _without_splinters(known: CubeFaces, cut: BoolArray, passed: BoolArray, volu
     They stay on the side that they share the largest faces with; `passed` are cut pairs that the blade does not cross.
     """
     piece = _pieces(volumes, replace(known, joined=known.joined & ~cut))
-    size = np.bincount(piece)
+    size = np.bincount(piece, known.edge.astype(np.float64) ** 3) / float(known.edge.min()) ** 3
     sides = piece[known.pairs]
     cut = cut.copy()
     for k in np.unique(sides[passed]):
-        if size[k] > SPLINTER:
+        if size[k] >= SPLINTER:
             continue
         other = np.where(sides[:, 0] == k, sides[:, 1], sides[:, 0])
         own = cut & (sides == k).any(axis=1) & (other != k)

@@ -19,7 +19,7 @@ NAMES = {1: "gel", 2: "lump"}
 def scan(kind: str, direction: FloatArray) -> tuple[Volume, IntArray]:
     """Return a cube of gel around a ball or a rod along z, its grid in some direction."""
     n = round(SIDE_MM / VOXEL_MM)
-    z, y, x = (VOXEL_MM * (np.indices((n,) * 3) + 0.5) - 0.5 * SIDE_MM - 1.3)
+    z, y, x = VOXEL_MM * (np.indices((n,) * 3) + 0.5) - 0.5 * SIDE_MM - 1.3
     distance = np.hypot(np.hypot(x, y), z) if kind == "ball" else np.hypot(x, y)
     volume = Volume.from_array(np.ones((n,) * 3, np.uint8), spacing_mm=(VOXEL_MM,) * 3, direction=direction)
     return volume, np.where(distance < RADIUS_MM, 2, 1)

@@ -40,12 +40,29 @@ def transferred_contact(
     ]
     source = np.concatenate([*sources, np.zeros(0, np.int64)])
     first = np.cumsum([0, *(len(s) for s in sources)]).astype(np.int64)
-    held = ("mode", "touched", "compression", "extension", "friction")
+    held = ("mode", "touched", "compression", "extension", "friction", "begun")
     return replace(
         contact, order=order, first=first, multiplier=np.ascontiguousarray(multiplier),
+        thickness=_transferred_thickness(contact.thickness, before, after),
         acceleration=np.zeros((3, len(after.points))), lasting=np.zeros(1),
         **{name: getattr(contact, name)[source] for name in held},
     )  # fmt: skip
+
+
+def _transferred_thickness(thickness: FloatArray, before: ContactSurface, after: ContactSurface) -> FloatArray:
+    """Return the thickness (k, f) of the foundations after, as thick in mm as those of the nearest faces before."""
+    nearest = nearest_points(_middles(before), _middles(after))
+    edges = _edges(before)[nearest] / _edges(after)
+    return np.ascontiguousarray(thickness[:, nearest] * edges)
+
+
+def _middles(surface: ContactSurface) -> FloatArray:
+    return points_with_normals(surface.points[surface.faces].mean(axis=1)[:, None], surface.points, surface.faces)
+
+
+def _edges(surface: ContactSurface) -> FloatArray:
+    corners = surface.points[surface.faces]
+    return np.asarray(np.sqrt(np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, -1] - corners[:, 0]), axis=1)))
 
 
 def surface_points(surface: ContactSurface, order: int) -> FloatArray:

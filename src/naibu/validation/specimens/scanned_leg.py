@@ -133,7 +133,7 @@ def _section(shape: LegShape, element_size_mm: float) -> tuple[FloatArray, IntAr
         turns = np.arange(n := max(10, int(2.0 * np.pi * r / (0.8 * h)))) * (2.0 * np.pi / n)
         curves.append([x, y] + r * np.stack([np.cos(turns), np.sin(turns)], axis=1))
     borders = np.concatenate(curves)
-    rows, columns = np.mgrid[-60.0 : 60.0 : 0.87 * h, -60.0 : 60.0 : h]
+    rows, columns = np.mgrid[-60.0 : 60.0 : 0.87 * h, -60.0:60.0:h]
     columns[::2] += 0.5 * h
     inside = np.stack([columns.ravel(), rows.ravel()], axis=1)
     apart = np.min(np.linalg.norm(inside[:, None] - borders[None], axis=2), axis=1) > 0.62 * h

@@ -178,5 +178,3 @@ def probability(found: RefinedLinks, reference: FloatArray, deformed: FloatArray
         near = np.asarray(cKDTree(reference[linked]).query(reference[linked], k=min(WITNESSES, len(linked)), workers=-1)[1])
         out[linked] = likely * np.minimum(likely[near.reshape(len(linked), -1)].mean(axis=1) / CREDIBLE, 1.0)
     return out
-
-

@@ -262,10 +262,14 @@ def _is_far(gap, width, curvature):  # type: ignore[no-untyped-def]  # pragma: n
 
 
 @njit(cache=True)
-def rest_at(x, indenters, surface, compression):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set the compression of all foundations to what indenters cover at the positions x: a contact that begins there exerts nothing."""
+def rest_at(x, indenters, surface, begun, history):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set the compression of the foundations at points (p,) that have not `begun` so that they exert nothing at the positions x.
+
+    It is what indenters cover there, and what cancels the pressure that nodes carry for other faces.
+    """
     (geometry, axes), centres, _, _, form = indenters
-    corners, _, _, shapes, weights, first, rule = surface
+    corners, _, foundation, shapes, weights, first, rule = surface
+    compression, multiplier, thickness = history[2], history[5], history[6]
     at, speed, across = np.empty((4, 3)), np.empty((4, 3)), np.empty(3)
     d, q, m, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
     for k in range(len(centres)):
@@ -276,9 +280,15 @@ def rest_at(x, indenters, surface, compression):  # type: ignore[no-untyped-def]
             _face_normal(at, across)
             for g in range(each):
                 p = first[k] + f * each + g
+                if begun[p]:
+                    continue
                 _combine(shapes[rule[k] + g], at, d)
                 gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
-                compression[p] = _covered(-gap, _slope(n, across), np.sqrt(weights[p]), form[k, 0])[0]
+                depth, covered, _ = _covered(-gap, _slope(n, across), np.sqrt(weights[p]), form[k, 0])
+                carried = 0.0
+                for c in range(4):
+                    carried += shapes[rule[k] + g, c] * multiplier[k, corners[f, c]]
+                compression[p] = depth + covered * carried * thickness[k, f] / foundation[f, 0]
 
 
 @njit(cache=True)

@@ -94,11 +94,11 @@ class ContactStepper:
         points = _points(surface, own)
         scratch = _scratch(len(surface.faces), len(indenters), len(own.mode), len(base.mass))
         stepper = cls(base, own, surface, geometry, friction, pull, form, passes, tuple(indenters), divided, points, scratch)
-        if not own.begun:
-            own.begun[...] = True
+        if not own.begun.all():
             corners, spread, *rest = points
             faces = (corners, spread, surface.foundation(base.step), *rest)
-            rest_at(base.position, packed(*stepper._shapes()), packed(*faces), own.compression)
+            rest_at(base.position, packed(*stepper._shapes()), packed(*faces), own.begun, packed(*own.history()))
+            own.begun[:] = True
         stepper._look_everywhere()
         return stepper
 

@@ -44,8 +44,8 @@ class ContactState:
         Reference points of the indenters, mm.
     axes : ndarray, shape (indenters, 3, 3)
         Axes of the indenters, in rows.
-    begun : ndarray, shape (), bool
-        Whether the foundations are compressed by what the indenters cover at the start.
+    begun : ndarray, shape (p,), bool
+        Whether the compression counts; the others are compressed, when steps begin, by what the indenters cover then, and exert nothing.
     acceleration : ndarray, shape (3, n)
         Mean acceleration of the nodes in the last step, mm/s2, from which the next one begins.
     lasting : ndarray, shape (1,)
@@ -146,7 +146,7 @@ def begin_contact(
     gap, first = np.concatenate(gaps), np.cumsum([0, *(len(g) for g in gaps)]).astype(np.int64)
     touched, none, at_node = gap < TOUCH_MM, np.zeros(len(gap)), np.zeros((len(indenters), lattice.n_nodes))
     centres, axes = np.array([p.centre for p in indenters], dtype=float), np.array([p.geometry.axes for p in indenters], dtype=float)
-    begun, traction = np.zeros((), dtype=bool), np.zeros((len(gap), 3))
+    begun, traction = np.zeros(len(gap), dtype=bool), np.zeros((len(gap), 3))
     thickness = np.array([surface.thickness(p.geometry) for p in indenters])
     return ContactState(
         order, first, touched.astype(np.int8), touched, none, none.copy(), traction, at_node, thickness, centres, axes,
