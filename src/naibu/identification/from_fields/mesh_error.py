@@ -23,6 +23,7 @@ from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of
 from naibu.meshing.point_location import interpolation_operator
+from naibu.meshing.surface import CELL_FACES
 
 EXTRAPOLATED = 1.4  # whole error over the change to half the element size: 1 / (1 - 2^-1.8)
 DOUBT = (
@@ -90,8 +91,8 @@ def one_cell_thick(mesh: Mesh) -> tuple[str, ...]:
     The displacement in them is linear from border to border; a layer under a surface with unknown forces then bends and shears otherwise
     than it does, and half the size, with the surface as on the mesh, hardly shows it.
     """
-    faces = np.array([[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [3, 2, 6, 7], [0, 1, 2, 3], [4, 5, 6, 7]])  # opposite ones in pairs
-    _, number = np.unique(np.sort(mesh.cells[:, faces].reshape(-1, 4), axis=1), axis=0, return_inverse=True)
+    faces = mesh.cells[:, CELL_FACES["hexahedron"]]  # opposite ones in pairs
+    _, number = np.unique(np.sort(faces.reshape(-1, 4), axis=1), axis=0, return_inverse=True)
     number = number.ravel()
     region = np.repeat(mesh.regions, 6)
     total, squares = np.bincount(number, region), np.bincount(number, region.astype(float) ** 2)

@@ -17,6 +17,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
 from naibu.meshing.point_location import locate
+from naibu.meshing.surface import boundary_faces
 
 FARTHEST = 0.45  # of the shortest edge along an axis: way of a node along it
 FLATTEST = 0.15  # of the mean volume density of a cell: least one at its corners
@@ -100,10 +101,7 @@ class Distances:
 def _held(mesh: Mesh, start: FloatArray) -> BoolArray:
     """Return along which axes of the grid nodes (n, 3) may not move: those of the faces at the surface on which they lie."""
     held = np.zeros((mesh.n_points, 3), dtype=bool)
-    faces = np.array([[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [3, 2, 6, 7], [0, 1, 2, 3], [4, 5, 6, 7]])
-    every = mesh.cells[:, faces].reshape(-1, 4)
-    _, first, count = np.unique(np.sort(every, axis=1), axis=0, return_index=True, return_counts=True)
-    for face in every[first[count == 1]]:
+    for face in boundary_faces(mesh).faces:
         held[face, int(np.argmin(np.ptp(start[face], axis=0)))] = True
     return held
 

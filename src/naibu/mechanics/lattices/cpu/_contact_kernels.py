@@ -31,6 +31,7 @@ from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
 AGREED_FRICTION = 2e-3  # likewise of the friction, of the sum of its limits
 LOOSE = 5e-3  # tolerance from which on passes may be rough; with a tighter one, no early end is to decide which points slip
+STRICT = 0.1  # by which contacts agree more closely with a tighter tolerance
 ROUGHLY, ROUGH_PASSES = 0.3, 2  # reduction of the residual of a pass whose contacts may be far from those of the solution, and how many
 
 
@@ -62,6 +63,7 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
     count, indenters, motion, surface, history, lists, slid, points, slot, diagonal, room = contact
     given, plain, origin = vectors
     operator = inner[OPERATOR]
+    strict = 1.0 if tolerance >= LOOSE else STRICT
     iterations, lost, goal, share, ended, ended_before = 0, 0.0, 0.0, 0.0, False, False
     for attempt in range(-1, most):  # before the first solution, points are linearized about the velocity as it is
         if attempt >= 0:
@@ -89,7 +91,7 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
         wrong, wrong_friction, total, limits = look(
             count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins, room
         )
-        if ended and wrong <= AGREED * total and wrong_friction <= AGREED_FRICTION * limits + 1e-300:
+        if ended and wrong <= strict * AGREED * total and wrong_friction <= strict * AGREED_FRICTION * limits + 1e-300:
             return iterations, attempt + 1, lost, True, share
     return iterations, most, lost, False, share
 
