@@ -17,13 +17,13 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
 from naibu.meshing.point_location import locate
+from naibu.meshing.quality import min_jacobians, signed_volumes
 from naibu.meshing.surface import boundary_faces
 
 FARTHEST = 0.45  # of the shortest edge along an axis: way of a node along it
 FLATTEST = 0.15  # of the mean volume density of a cell: least one at its corners
 STEPS, SWEEPS, CUTS = 4, 60, 12  # towards the border; of relaxation; of movements that flatten cells
 MOST_VOXELS = 20_000_000  # of the grid on which distances from borders are computed
-_CORNERS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=float)
 
 
 def fitted_to_borders(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, region_of_voxel: IntArray) -> tuple[Mesh, IntArray]:
@@ -42,15 +42,12 @@ def fitted_to_borders(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, regio
     region_of_voxel : ndarray, shape (nz, ny, nx), int64
         Region of every voxel of the object; what it is elsewhere does not matter.
     """
-    spacing = np.asarray(inside.spacing_mm)
     start = inside.to_index(mesh.points)  # along the axes of the grid, in voxels
     edge = np.array([np.ptp(start[mesh.cells, axis], axis=1).min() for axis in range(3)])
     held = _held(mesh, start)
     border, way = _towards_borders(mesh, start, held, edge, Distances.of(inside, region_of_voxel))
     way = _relaxed(mesh, way, border, held)
-    part = _unflattened(mesh.cells, start * spacing, way * spacing)
-    moved = start + part[:, None] * way
-    fitted = replace(mesh, points=inside.to_physical(moved))
+    fitted = _unflattened(mesh, inside.to_physical(start), inside.to_physical(start + way))
     return fitted, _cells_of_voxels(fitted, mesh, cell_of_voxel, inside)
 
 
@@ -146,29 +143,23 @@ def _relaxed(mesh: Mesh, way: FloatArray, border: BoolArray, held: BoolArray) ->
     return np.asarray(out)
 
 
-def _unflattened(cells: IntArray, start_mm: FloatArray, way_mm: FloatArray) -> FloatArray:
-    """Return which part of its way (n,) every node may go for no cell to become flat."""
-    part = np.ones(len(start_mm))
+def _unflattened(mesh: Mesh, start: FloatArray, end: FloatArray) -> Mesh:
+    """Return the mesh with nodes moved from start to end (n, 3), mm, each as far as no cell becomes flat."""
+    part = np.ones(len(start))
     for _ in range(CUTS):
-        points = (start_mm + part[:, None] * way_mm)[cells]
-        flat = _flatness(points) < FLATTEST
+        moved = replace(mesh, points=start + part[:, None] * (end - start))
+        flat = _flatness(moved) < FLATTEST
         if not flat.any():
-            return part
-        part[np.unique(cells[flat])] *= 0.75
-    part[np.unique(cells[_flatness((start_mm + part[:, None] * way_mm)[cells]) < FLATTEST])] = 0.0
-    return part
+            return moved
+        part[np.unique(mesh.cells[flat])] *= 0.75
+    moved = replace(mesh, points=start + part[:, None] * (end - start))
+    part[np.unique(mesh.cells[_flatness(moved) < FLATTEST])] = 0.0
+    return replace(mesh, points=start + part[:, None] * (end - start))
 
 
-def _flatness(points: FloatArray) -> FloatArray:
-    """Return the least Jacobian determinant at the corners of hexahedra (m, 8, 3) over its mean, (m,)."""
-    densities = []
-    for at in _CORNERS:
-        factors = 1.0 + _CORNERS * at
-        others = np.stack([factors[:, [1, 2]].prod(axis=1), factors[:, [0, 2]].prod(axis=1), factors[:, [0, 1]].prod(axis=1)], axis=1)
-        densities.append(np.linalg.det(np.einsum("ai,maj->mij", 0.125 * _CORNERS * others, points)))
-    density = np.stack(densities)
-    mean = density.mean(axis=0)
-    return np.asarray((density * np.sign(mean)).min(axis=0) / np.maximum(np.abs(mean), 1e-300))
+def _flatness(mesh: Mesh) -> FloatArray:
+    """Return the least Jacobian determinant in hexahedra over its mean, (m,)."""
+    return min_jacobians(mesh) / (signed_volumes(mesh) / 8.0)
 
 
 def _cells_of_voxels(fitted: Mesh, before: Mesh, cell_of_voxel: IntArray, inside: Volume) -> IntArray:
