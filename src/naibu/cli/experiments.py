@@ -113,7 +113,8 @@ def identify(
     loaded
         With fields: a side where forces act, x-, x+, y-, y+, z- or z+, if they act at no other. May be repeated.
     cell_map
-        With fields: map the unknown moduli cell by cell, and make regions of the map.
+        With fields: map the unknown moduli cell by cell, and make regions of the map. Without --known they are multiples of that of the
+        largest region.
     unit
         With fields in tables and meshes: their unit, where they do not state it; by default mm.
     spacing_mm

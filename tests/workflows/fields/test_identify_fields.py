@@ -211,3 +211,22 @@ def test_files_that_do_not_belong_together_are_told(folder: Path) -> None:
         identify_fields(folder / "far.h5", zones=folder / "labels.mha", known=["label 2=10 kPa"])
     with pytest.raises(InputError, match="give `mask`"):
         identify_fields(folder / "field.h5", known=["body=10 kPa"])
+
+
+def test_a_map_without_a_known_zone_is_relative_to_its_largest_region(folder: Path) -> None:
+    """A gel of 5 kPa under one of 10 kPa: multiples of the latter, 1/2 in all that lies below."""
+    run = identify_fields(
+        folder / "field.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=6.7, out=folder / "map"
+    )
+    found = run.estimate
+    count, zones = np.bincount(found.zones.of_cell), found.zones
+    assert 2 <= zones.count <= 4 and not zones.known and len(count) == zones.count and zones.of_cell.min() == 0
+    height = run.body.mesh.points[found.mesh.cells].mean(axis=1)[:, 2] - found.mesh.points[:, 2].min()
+    young, _ = found.intervals()
+    for zone, middle in enumerate(np.bincount(zones.of_cell, height) / count):
+        if zone == int(np.argmax(count)):
+            assert middle > 20.0 and found.young_modulus[zone] == pytest.approx(1.0) and young[zone] == pytest.approx([1.0, 1.0])
+        else:
+            assert middle < 20.0 and young[zone][0] < 0.5 < young[zone][1] < 1.0
+    assert run.relative and run.unit == "multiples of the largest region" and "kPa" not in " ".join(run.notes)
+    assert "largest region" in (folder / "map" / "report.html").read_text() and (folder / "map" / "model.json").exists()

@@ -5,7 +5,7 @@ As for the discretisation (`mesh_error`), the states under another assumption ch
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -33,7 +33,7 @@ class Assumption:
     text : str
         The other assumption in words.
     theta : ndarray, shape (2 count,)
-        By how much it would change ln mu and ln(kappa / mu) of the zones.
+        By how much it would change ln mu and ln(kappa / mu) of the zones, to first order.
     standard_deviations : float
         How many standard deviations it is away from what was assumed; zero where it is a question of the model.
     """
@@ -42,9 +42,22 @@ class Assumption:
     theta: FloatArray
     standard_deviations: float
 
+    def applied(self, theta: FloatArray) -> FloatArray:
+        """Return the logarithms of the moduli (2 count,) under the assumption, from those found.
 
-def assumptions(at: Linearised, quadratic: Concentrated, law: LawName) -> tuple[Assumption, ...]:
-    """Return what other moduli of the known regions, and the other law, would do to the result."""
+        A change that was found to first order is one of ln mu, and one of mu / kappa rather than of its logarithm, which data near
+        incompressibility leave open by many times; where mu / kappa would fall below 0, ln(kappa / mu) is that of a Poisson's ratio of 0.5.
+        """
+        k = len(theta) // 2
+        less = np.maximum(1.0 - self.theta[k:], 1e-12)
+        return np.concatenate([theta[:k] + self.theta[:k], theta[k:] - np.log(less)])
+
+
+def assumptions(at: Linearised, quadratic: Concentrated, law: LawName, stretch: FloatArray) -> tuple[Assumption, ...]:
+    """Return what other moduli of the known regions, and the other law, would do to the result.
+
+    `stretch` (2 count,) is by how much more changes of logarithms are after extrapolation to vanishing element size (see `stretch_of`).
+    """
     model, out = at.model, []
     for number, region in enumerate(model.zones.known):
         cells = model.zones.region_of_cell == number
@@ -60,7 +73,7 @@ def assumptions(at: Linearised, quadratic: Concentrated, law: LawName) -> tuple[
         changed = _refitted(at, quadratic, field_law(model.computed, other, averaged=model.averaged), lame, shear)
         if changed is not None:
             out.append(Assumption(f"with {LAW_NAMES[other]}", changed, 0.0))
-    return tuple(out)
+    return tuple(replace(one, theta=one.theta * stretch) for one in out)
 
 
 def covariance_of(found: tuple[Assumption, ...], size: int) -> FloatArray:
@@ -90,7 +103,7 @@ def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray, with
     young, poisson = young_and_poisson(theta)
     lines = []
     for one in found:
-        other, ratio = young_and_poisson(theta + one.theta)
+        other, ratio = young_and_poisson(one.applied(theta))
         rows = [
             f"{name} {100 * (a / b - 1):+.2g} %, Poisson's ratio {c - d:+.3f}"
             for name, a, b, c, d in zip(zones.names[:3], other, young, ratio, poisson, strict=False)
@@ -114,10 +127,10 @@ def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
     of_young = OTHER_YOUNG / region.young_modulus_sd if region.young_modulus_sd > 0.0 else 0.0
     of_poisson = abs(near - poisson) / region.poisson_ratio_sd if region.poisson_ratio_sd > 0.0 else 0.0
     stiffer = (1.0 + OTHER_YOUNG) * young
-    return [
-        (f"with {stiffer:.4g} kPa for {young:.4g} kPa of {region.name!r}", stiffer, poisson, of_young),
-        (f"with Poisson's ratio {near:.3g} for {poisson:.3g} of {region.name!r}", young, near, of_poisson),
-    ]
+    other_ratio = (f"with Poisson's ratio {near:.3g} for {poisson:.3g} of {region.name!r}", young, near, of_poisson)
+    if region.is_unit:
+        return [other_ratio]
+    return [(f"with {stiffer:.4g} kPa for {young:.4g} kPa of {region.name!r}", stiffer, poisson, of_young), other_ratio]
 
 
 def _refitted(at: Linearised, quadratic: Concentrated, law: FieldLaw, lame: FloatArray, shear: FloatArray) -> FloatArray | None:

@@ -361,8 +361,8 @@ class _Recipe:
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders))
         on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
-        others = assumptions(at, quadratic, self.law)
-        of_known = covariance_of(others, len(theta)) * np.outer(stretch, stretch)
+        others = assumptions(at, quadratic, self.law, stretch)
+        of_known = covariance_of(others, len(theta))
         of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
         thin = () if self.region_at is None or corrected is not None else one_cell_thick(model.mesh)
         if shift is not None:
@@ -382,7 +382,7 @@ class _Recipe:
             judged = judged_within_cells(judged, model.zones.names, half)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         sure = judged.explanation is Explanation.EXPLAINED and not coarse
-        how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
+        how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure, unit=model.zones.unit)
         words = (judged.sentence, *judged.notes, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
         if coarse:
             words = (words[0], TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1]), *words[1:])

@@ -176,32 +176,50 @@ def intervals(theta: FloatArray, found: Uncertainty, level: float = 0.95) -> tup
 
 
 def report(
-    zones: Zones, theta: FloatArray, found: Uncertainty, *, budget: ErrorBudget | None = None, usable: bool = True, sure: bool = True
+    zones: Zones,
+    theta: FloatArray,
+    found: Uncertainty,
+    *,
+    budget: ErrorBudget | None = None,
+    usable: bool = True,
+    sure: bool = True,
+    unit: str = " kPa",
 ) -> tuple[str, ...]:
     """Say in words how well every zone's moduli are determined, from what the uncertainty stems, and what is determined worst.
 
     Nothing is called well determined unless the model explains the data and its elements are fine enough (`sure`); nor anything determined
-    where the result is not `usable`.
+    where the result is not `usable`. `unit` is that of moduli: none of multiples.
     """
     young, poisson = young_and_poisson(theta)
     of_young, of_poisson = found.of_young_and_poisson(theta)
     within = intervals(theta, found)
     lines = []
+    how = {"usable": usable, "sure": sure}
     for i, name in enumerate(zones.names):
-        line = _sentence(name, young[i], of_young[i], within[0][i], poisson[i], of_poisson[i], within[1][i], usable=usable, sure=sure)
+        line = _sentence(name, young[i], of_young[i], within[0][i], poisson[i], of_poisson[i], within[1][i], unit, **how)
         lines.append(line + ("" if budget is None or not np.isfinite(of_young[i]) else _parts(budget, i, zones.count)))
     return (*lines, _worst(zones, found))
 
 
 def _sentence(
-    name: str, young: float, of_young: float, e: FloatArray, poisson: float, of_poisson: float, nu: FloatArray, *, usable: bool, sure: bool
+    name: str,
+    young: float,
+    of_young: float,
+    e: FloatArray,
+    poisson: float,
+    of_poisson: float,
+    nu: FloatArray,
+    unit: str,
+    *,
+    usable: bool,
+    sure: bool,
 ) -> str:
     if not np.isfinite(of_young):
         return f"{name}: the measurements do not determine its moduli."
     best = "well" if sure else "within the model"
     how = f"{best if of_young < WELL else 'roughly' if of_young < POORLY else 'poorly'} determined"
-    text = f"{name}: Young's modulus {young:.4g} kPa is {how if usable else 'not to be used'} (standard error {100 * of_young:.2g} %, "
-    text += f"95 % interval {e[0]:.4g} to {e[1]:.4g} kPa)"
+    text = f"{name}: Young's modulus {young:.4g}{unit} is {how if usable else 'not to be used'} (standard error {100 * of_young:.2g} %, "
+    text += f"95 % interval {e[0]:.4g} to {e[1]:.4g}{unit})"
     if of_poisson > POISSON_POORLY:
         return text + f"; Poisson's ratio {poisson:.3f} is not (standard error {of_poisson:.2g}): take it from elsewhere."
     return text + f", Poisson's ratio {poisson:.3f} ({nu[0]:.3f} to {nu[1]:.3f})."

@@ -25,6 +25,7 @@ from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
+from naibu.identification.from_fields.relative_map import identify_relative_map
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
@@ -48,7 +49,7 @@ from naibu.workflows.fields.block_mesh import (
     sizes_of_voxels,
 )
 from naibu.workflows.fields.border_fitting import fitted_to_borders
-from naibu.workflows.fields.known_zones import parse_known_zones
+from naibu.workflows.fields.known_zones import NOTHING_KNOWN, parse_known_zones
 from naibu.workflows.fields.measured_load_case import doubts_of_scale, measured_load_case, relative_deformation
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
@@ -99,7 +100,9 @@ class FieldIdentification(ShownInNotebook):
     @property
     def unit(self) -> str:
         """Unit of Young's modulus."""
-        return "multiples of the known zone" if self.relative else "kPa"
+        if not self.relative or self.estimate.zones.known:
+            return "multiples of the known zone" if self.relative else "kPa"
+        return "multiples of the median" if self.estimate.uncertainty is None else "multiples of the largest region"
 
     def page_html(self) -> str:
         """Return the page of the result, a whole HTML document."""
@@ -153,6 +156,7 @@ def identify_fields(
         Names of labels; by default ``"label 1"`` and so on.
     known : sequence of str
         ``"gel=12 kPa"``, ``"gel=12 kPa, 0.45"`` with Poisson's ratio, ``"bone=rigid"``; or only a name, of which the others are multiples.
+        A map needs none: moduli are then multiples of that of its largest region.
     loaded : sequence of str
         Sides of the object at which forces act, where they act at no other: ``x-``, ``x+``, ``y-``, ``y+``, ``z-``, ``z+`` in the frame of
         the scan. By default they may act on the whole surface. A surface that is known to be free tells much of the moduli.
@@ -189,7 +193,7 @@ def identify_fields(
     _require_different(paths, read)
     inside, labels = labelled_object(mask, zones)
     names = names_of_labels(labels, inside, zone_names or {})
-    stated = parse_known_zones(known, list(names.values()))
+    stated = parse_known_zones(known, list(names.values())) if known or not each_cell else NOTHING_KNOWN
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
     most = CELLS_OF_MAP if each_cell else min(CELLS, max(int(field.valid.sum()) for field in read) // POINTS_OF_CELL)
@@ -202,10 +206,12 @@ def identify_fields(
         left_out, wrong = misplaced(mesh, cell_of_voxel, inside, labels, names)
     cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem, loaded) for p, field in zip(paths, read, strict=True)]
     within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
-    found = identify_field(
-        mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law,
-        bounds=_bounds([young for young, _ in stated.values.values()]), region_at=within, progress=progress,
-    )  # fmt: skip
+    bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])
+    if stated.values:
+        sought_zones = Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative)
+        found = identify_field(mesh, cases, sought_zones, law=law, bounds=bounds, region_at=within, progress=progress)
+    else:
+        found = identify_relative_map(mesh, cases, law=law, bounds=bounds, progress=progress)
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
         found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
@@ -273,7 +279,7 @@ def table_of_assumptions(result: FieldIdentification) -> Table:
     if found.uncertainty is not None:
         inside = found.intervals()[0]
         for one in found.assumptions:
-            young, poisson = young_and_poisson(found.theta + one.theta)
+            young, poisson = young_and_poisson(one.applied(found.theta))
             for name, e, nu, (low, high) in zip(found.zones.names, young, poisson, inside, strict=True):
                 rows.append((one.text, name, float(e), float(nu), "yes" if low <= e <= high else "no"))
     columns = ("other assumption", "zone", f"Young's modulus, {result.unit}", "Poisson's ratio", "modulus within the interval above")

@@ -22,6 +22,9 @@ class KnownZones:
     relative: bool
 
 
+NOTHING_KNOWN = KnownZones({}, {}, relative=True)
+
+
 def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
     """Read ``"gel=12 kPa"``, ``"gel=12 kPa, 0.45"``, ``"bone=rigid"`` or ``"gel"``.
 
@@ -49,7 +52,7 @@ def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
     if not values:
         raise InputError(
             f"known names no zone with a modulus, so that nothing sets the scale; name one of {', '.join(map(repr, names))}, "
-            "with its Young's modulus, or without it for ratios"
+            "with its Young's modulus, or without it for ratios; a map of moduli (each_cell) needs none"
         )
     if relative and len(values) > 1:
         raise InputError("known states the modulus of some zones and leaves that of another open; state all, or name one")

@@ -85,6 +85,8 @@ class KnownRegion:
         Relative standard deviation of Young's modulus.
     poisson_ratio_sd : float
         Standard deviation of Poisson's ratio.
+    is_unit : bool
+        Whether its modulus is not known, but the unit of the others.
     """
 
     name: str
@@ -92,6 +94,7 @@ class KnownRegion:
     poisson_ratio: float
     young_modulus_sd: float = 0.0
     poisson_ratio_sd: float = 0.0
+    is_unit: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,6 +130,7 @@ class Zones:
         known: Mapping[str, tuple[float, float]],
         each_cell: bool | Sequence[str] = False,
         known_sd: Mapping[str, tuple[float, float]] | None = None,
+        relative: bool = False,
     ) -> Zones:
         """Make one zone of every region that is not known, or of every cell of it.
 
@@ -141,6 +145,8 @@ class Zones:
         known_sd : mapping, optional
             Relative standard deviation of Young's modulus and standard deviation of Poisson's ratio of known regions; it becomes part of
             the uncertainty of what is identified. Zero by default.
+        relative : bool
+            Whether Young's moduli of the known regions are not known, but the unit of the others.
 
         Raises
         ------
@@ -161,7 +167,7 @@ class Zones:
             if region in known:
                 lame[cells], shear[cells] = lame_parameters(*known[region])
                 region_of_cell[cells] = len(regions)
-                regions.append(KnownRegion(region, *known[region], *doubt.get(region, (0.0, 0.0))))
+                regions.append(KnownRegion(region, *known[region], *doubt.get(region, (0.0, 0.0)), is_unit=relative))
             elif each_cell if isinstance(each_cell, bool) else region in each_cell:
                 of_cell[cells] = len(names) + np.arange(len(cells))
                 names += [f"{region}: cell {c}" for c in cells]
@@ -176,6 +182,11 @@ class Zones:
     def count(self) -> int:
         """Number of unknown zones."""
         return len(self.names)
+
+    @property
+    def unit(self) -> str:
+        """Unit of moduli after a number: none where that of a region is the unit."""
+        return "" if any(region.is_unit for region in self.known) else " kPa"
 
     def per_cell(self, lame_lambda: ArrayLike, shear_modulus: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return lambda and mu of every cell (m,), kPa, from those of the zones (count,)."""
