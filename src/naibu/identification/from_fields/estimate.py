@@ -68,7 +68,7 @@ from naibu.identification.from_fields.regularization_weight import WeightChoice,
 from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
-from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells
+from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells, limited_by_elements
 from naibu.identification.load_case import require_load_cases
 from naibu.identification.verdict import Explanation
 
@@ -380,6 +380,9 @@ class _Recipe:
         if self.region_at is not None and shift is not None:
             half = HalfSize(point.theta, theta, on_mesh, beyond_noise=(point.misfit - freedom, misfit - freedom))
             judged = judged_within_cells(judged, model.zones.names, half)
+        if shift is not None:
+            by_elements = replace(of_noise, covariance=covariance * np.outer(stretch, stretch)).of_young_and_poisson(theta)[0]
+            judged = limited_by_elements(judged, model.zones.names, by_elements, intervals(theta, total)[0])
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         sure = judged.explanation is Explanation.EXPLAINED and not coarse
         how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure)
