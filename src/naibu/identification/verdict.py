@@ -44,6 +44,8 @@ class Verdict:
         What else to know.
     outliers : tuple of str
         Points that were left out, one sentence each.
+    limits : str
+        What is known only roughly although the model explains the data, in words that follow "but"; empty where nothing is.
     """
 
     explanation: Explanation
@@ -54,6 +56,7 @@ class Verdict:
     shared: float
     notes: tuple[str, ...] = ()
     outliers: tuple[str, ...] = ()
+    limits: str = ""
 
     @property
     def ok(self) -> bool:
@@ -63,13 +66,13 @@ class Verdict:
     @property
     def sentence(self) -> str:
         """The verdict in one sentence."""
-        what = self.explanation.value
+        what = self.explanation.value + f", but {self.limits}" * bool(self.limits)
         return f"{what[0].upper()}{what[1:]}: {'; '.join(self.reasons[:3]) or self.lead}."
 
     @property
     def reservation(self) -> str:
         """The sentence where something speaks against the model, else nothing."""
-        return "" if self.explanation is Explanation.EXPLAINED else self.sentence
+        return "" if self.explanation is Explanation.EXPLAINED and not self.limits else self.sentence
 
     def to_dict(self) -> dict[str, Any]:
         """Return what a file of results tells of it."""

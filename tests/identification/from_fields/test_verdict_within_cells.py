@@ -9,7 +9,7 @@ import pytest
 
 from naibu.identification.from_fields.forward.sensitivities import logarithms
 from naibu.identification.from_fields.uncertainty import Uncertainty
-from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells
+from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells, limited_by_elements
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
@@ -74,3 +74,22 @@ def test_shared_residuals_that_smaller_elements_leave_come_first() -> None:
     assert "elements of half the size leave such residuals as well" in stay.reasons[1] and "use smaller ones" not in stay.sentence
     fall = judged_within_cells(IN_PART, NAMES, replace(moved, beyond_noise=(4000.0, 500.0)))
     assert not fall.ok and "use smaller ones" in fall.reasons[0] and fall.reasons[1] == SHARED
+
+
+@pytest.mark.parametrize("judged", [EXPLAINED, IN_PART])
+def test_a_modulus_that_elements_leave_open_is_in_the_first_sentence(judged: Verdict) -> None:
+    bounds = np.array([[8.0, 12.5], [8.0, 72.0]])
+    told = limited_by_elements(judged, NAMES, np.array([0.1, 0.5]), bounds)
+    start, _, end = told.sentence.partition(": ")
+    assert start.endswith(", but elements of this size tell Young's modulus only roughly, that of skin within a factor of 3")
+    assert "muscle" not in start and end == judged.sentence.partition(": ")[2]
+    assert told.reservation == told.sentence and told.ok
+    both = limited_by_elements(judged, NAMES, np.array([0.3, 0.5]), bounds).sentence
+    assert "that of muscle within a factor of 1.2 and that of skin within a factor of 3: " in both
+
+
+def test_moduli_that_elements_determine_leave_the_verdict_as_it_is() -> None:
+    bounds = np.array([[10.0, 12.0], [20.0, 30.0]])
+    for small in (np.array([0.05, 0.1]), np.full(2, np.nan)):
+        assert limited_by_elements(EXPLAINED, NAMES, small, bounds) is EXPLAINED
+    assert EXPLAINED.reservation == ""

@@ -186,6 +186,15 @@ def test_elements_smaller_than_voxels_are_refused_and_slices_thicker_than_elemen
         sizes_of_voxels(thick, -3.0)
 
 
+def test_what_is_rigid_hardly_bends() -> None:
+    """A bone held at both ends of a scan of 51 mm, across which muscle of 11 kPa is pressed by 30 %: the beam in closed form."""
+    young = parse_known_zones(["bone=rigid", "fat=5 kPa"], ["bone", "fat", "muscle"]).values["bone"][0]
+    radius_mm, length_mm = 5.5, 51.0
+    load = 0.3 * 11.0 * 2.0 * radius_mm  # mN/mm
+    bent = load * length_mm**4 / (384.0 * young * 0.25 * np.pi * radius_mm**4)
+    assert bent < 0.01
+
+
 def test_known_values_and_what_is_wrong_with_them() -> None:
     names = ["gel", "bone", "pad"]
     read = parse_known_zones(["gel=12 kPa", "bone=rigid"], names)

@@ -170,6 +170,14 @@ def test_the_doubt_of_zones_within_cells_is_the_whole_change() -> None:
     np.testing.assert_allclose(doubt_of(np.zeros(4), mixed=True, thin=np.array([False, True]))[0], np.array([0.5, 1.5, 0.5, 1.5]) / 1.4)
 
 
+def test_what_is_not_determined_does_not_make_the_others_doubtful() -> None:
+    """kappa / mu of a thin skin may move by any amount; it is doubted by as much, and the moduli that are determined by their own worst."""
+    shift = np.array([0.1, 0.3, 0.05, 4.0])
+    sure = np.array([True, True, True, False])
+    np.testing.assert_allclose(doubt_of(shift, mixed=True, sure=sure)[0], np.array([0.3, 0.3, 0.3, 4.0]) / 1.4)
+    np.testing.assert_allclose(doubt_of(shift, mixed=True)[0], 4.0 / 1.4)
+
+
 def test_cubes_that_do_not_show_a_zone_are_refused_or_made_smaller() -> None:
     """A round shell of a voxel or two: cubes of 6 mm do not have it, cubes of a voxel of 2 mm do, of which whole blocks need 8000."""
     z, _, x = np.indices((CELLS,) * 3)

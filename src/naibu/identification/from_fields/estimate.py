@@ -68,7 +68,7 @@ from naibu.identification.from_fields.regularization_weight import WeightChoice,
 from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
-from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells
+from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, limited_by_elements
 from naibu.identification.load_case import require_load_cases
 from naibu.identification.verdict import Explanation
 
@@ -368,21 +368,24 @@ class _Recipe:
         if shift is not None:
             relative = shift if corrected is not None else relative_change(shift)
             if corrected is None:
-                mixed = self.region_at is not None
+                mixed, sure = self.region_at is not None, on_mesh.standard_deviations() < DETERMINED
                 of_zones = np.isin(model.zones.names, thin) if thin else None
-                of_mesh, covariance = doubt_of(relative, mixed=mixed, thin=of_zones)
+                of_mesh, covariance = doubt_of(relative, mixed=mixed, thin=of_zones, sure=sure)
             else:
                 of_mesh, covariance = corrected.doubt
             of_mesh, total = of_mesh * stretch, total.with_added(covariance * np.outer(stretch, stretch))
-            coarse = bool(thin) or float(np.abs(relative).max()) > COARSE if corrected is None else not corrected.converged
+            coarse = bool(thin) or float(np.abs(relative[sure]).max(initial=0.0)) > COARSE if corrected is None else not corrected.converged
         total = total.with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         judged = verdict(model.observed, residuals, freedom)
         if self.region_at is not None and shift is not None:
             half = HalfSize(point.theta, theta, on_mesh, beyond_noise=(point.misfit - freedom, misfit - freedom))
             judged = judged_within_cells(judged, model.zones.names, half)
+        if shift is not None:
+            by_elements = replace(of_noise, covariance=covariance * np.outer(stretch, stretch)).of_young_and_poisson(theta)[0]
+            judged = limited_by_elements(judged, model.zones.names, by_elements, intervals(theta, total)[0])
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
-        sure = judged.explanation is Explanation.EXPLAINED and not coarse
-        how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=sure, unit=model.zones.unit)
+        fine = judged.explanation is Explanation.EXPLAINED and not coarse
+        how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=fine, unit=model.zones.unit)
         words = (judged.sentence, *judged.notes, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
         if coarse:
             words = (words[0], TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1]), *words[1:])

@@ -104,19 +104,23 @@ def one_cell_thick(mesh: Mesh) -> tuple[str, ...]:
     return tuple(name for name, part in zip(mesh.region_names, share, strict=True) if part > ONE_CELL)
 
 
-def doubt_of(shift: FloatArray, *, mixed: bool = False, thin: BoolArray | None = None) -> tuple[FloatArray, FloatArray]:
+def doubt_of(
+    shift: FloatArray, *, mixed: bool = False, thin: BoolArray | None = None, sure: BoolArray | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return standard deviations (2 count,) and covariance (2 count, 2 count) of extrapolated logarithms that changed by `shift`.
 
     Those of ln(kappa / mu) are relative to mu / kappa on the mesh (see `relative_change` and `stretch_of`).
     The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left. Where zones
     end inside of cells (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size. If regions
     are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than `ITSELF` times as
-    much.
+    much. Logarithms that the measurement does not determine move at no cost to the fit, and tell nothing of others: only those that are
+    `sure` (2 count,) count as the worst, and each gets at least the doubt of its own change.
     """
-    worst = max(float(np.abs(shift).max(initial=0.0)), 0.0 if thin is None else THIN)
+    told = np.abs(shift) if sure is None else np.abs(shift[sure])
+    worst = max(float(told.max(initial=0.0)), 0.0 if thin is None else THIN)
     part = 1.0 if mixed else DOUBT
     if worst > COARSE:
-        sd = np.full_like(shift, part / EXTRAPOLATED * worst)
+        sd = part / EXTRAPOLATED * np.maximum(worst, np.abs(shift))
         if thin is not None:
             sd = np.maximum(sd, part / EXTRAPOLATED * THIN * np.tile(np.where(thin, ITSELF, 1.0), 2))
         return sd, np.diag(sd**2)

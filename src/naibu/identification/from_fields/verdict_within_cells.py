@@ -1,4 +1,4 @@
-"""Verdict on zones that end inside of cells: whether moduli that the data determine stay when the cells are halved.
+"""Verdict on moduli that the size of cells changes: whether those that the data determine stay when the cells are halved.
 
 Where elements of half the size change a modulus by much, its correction to vanishing size, which is linear, is worth nothing, and the model
 on these elements is not one of the object. That holds for a modulus that the data determine. One that they leave open, such as the ratio of
@@ -22,6 +22,7 @@ from naibu.identification.verdict import Explanation, Verdict
 WITHIN = 0.5  # change of a logarithm from which a linear correction is worth nothing
 DETERMINED = 0.5  # standard deviation of a logarithm from measurement alone: 95 % intervals up to 7 times as high as low are determined
 NUMBERS = ("Young's modulus", "the shear modulus", "kappa / mu, hence Poisson's ratio,")
+ROUGHLY = 0.15  # standard deviation of ln E from the size of elements with which a modulus is known within a third, at 95 %
 FALLS = 0.75  # part of the misfit beyond noise that may be left on elements of half the size for these to be what explains it
 
 
@@ -89,6 +90,34 @@ def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize) -
     if judged.explanation is not Explanation.EXPLAINED and judged.shared > SHARED and not half.falls:
         reasons = (*judged.reasons, f"elements of half the size leave such residuals as well; but {reason}")
     return replace(judged, explanation=Explanation.NOT_EXPLAINED, reasons=reasons)
+
+
+def limited_by_elements(judged: Verdict, names: Sequence[str], of_mesh: FloatArray, bounds: FloatArray) -> Verdict:
+    """Return the verdict with the zones first whose modulus is known only roughly on elements of this size.
+
+    Residuals as small as the noise do not tell such errors, so that nobody should read of an explanation before he reads of them.
+
+    Parameters
+    ----------
+    judged : Verdict
+        On the residuals.
+    names : sequence of str
+        Zones.
+    of_mesh : ndarray, shape (count,)
+        Standard deviations of the logarithm of Young's modulus from the size of elements; NaN where they were not estimated.
+    bounds : ndarray, shape (count, 2)
+        95 % intervals of Young's modulus, kPa.
+    """
+    rough = np.flatnonzero(of_mesh > ROUGHLY)
+    if not len(rough) or not judged.ok:
+        return judged
+    factors = np.sqrt(bounds[rough, 1] / bounds[rough, 0])
+    each = [
+        f"that of {names[i]} " + (f"within a factor of {f:.2g}" if np.isfinite(f) else "not at all")
+        for i, f in zip(rough, factors, strict=True)
+    ]
+    known = f"elements of this size tell Young's modulus only roughly, {' and '.join(each)}"
+    return replace(judged, limits=known)
 
 
 def _told_open(name: str, which: IntArray, half: HalfSize, zone: int) -> str:

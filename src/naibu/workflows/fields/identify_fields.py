@@ -22,6 +22,7 @@ from naibu.identification.from_fields.estimate import TOO_COARSE, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
+from naibu.identification.from_fields.forward.representation_error import with_representation_error
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
@@ -57,6 +58,10 @@ from naibu.workflows.results.output_folder import output_folder
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
+UNRESOLVED = (
+    "{}: {:.2g} % of the measurements lie where displacements change on a scale below that of the elements; what these cannot follow is "
+    "counted as their noise."
+)
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
 BEYOND_KNOWN = 1e4  # times the stiffest, or part of the softest, known Young's modulus
@@ -205,6 +210,8 @@ def identify_fields(
         mesh, cell_of_voxel = fitted_to_borders(mesh, cell_of_voxel, inside, regions_of(labels, names))
         left_out, wrong = misplaced(mesh, cell_of_voxel, inside, labels, names)
     cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem, loaded) for p, field in zip(paths, read, strict=True)]
+    coarser = [(case, 0.0) if each_cell else with_representation_error(mesh, case) for case in cases]
+    cases = [case for case, _ in coarser]
     within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
     bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])
     if stated.values:
@@ -220,6 +227,7 @@ def identify_fields(
     )  # fmt: skip
     coarse = blurred(left_out, wrong, corrected=within is not None and found.mesh_shift is not None)
     scales = tuple(told for case in cases for told in doubts_of_scale(case.name, case.field))
+    coarse += tuple(UNRESOLVED.format(case.name, 100 * part) for case, part in coarser if part > 0.0)
     notes = (*found.identifiability[:1], *scales, *found.identifiability[1:], *coarse, *longer)
     result = FieldIdentification(found, body, stated.relative, notes, (*scales, *coarse), inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))

@@ -109,7 +109,7 @@ class IdentifiedBody:
         eighths: sp.csr_matrix | None = None
         if region_at is not None and found.mesh_shift is not None:
             parts, known_of_cell, eighths = _parts_within(found.mesh, zones, region_at)
-        doubtful = found.verdict is not None and not found.verdict.ok
+        doubtful = found.verdict is not None and (not found.verdict.ok or bool(found.verdict.limits))
         noise = float(np.sqrt(np.mean([whitening(case.field, case.name)[1] ** 2 for case in load_cases])))
         return cls(
             found.mesh, axes, zones.names, parts, found.theta,
