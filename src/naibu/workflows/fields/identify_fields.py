@@ -49,7 +49,7 @@ from naibu.workflows.fields.block_mesh import (
 )
 from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.known_zones import parse_known_zones
-from naibu.workflows.fields.measured_load_case import doubts_of_scale, measured_load_case, relative_deformation
+from naibu.workflows.fields.measured_load_case import doubts_of_field, measured_load_case, relative_deformation
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 
@@ -213,9 +213,9 @@ def identify_fields(
         region_at=within,
     )  # fmt: skip
     coarse = blurred(left_out, wrong, corrected=within is not None and found.mesh_shift is not None)
-    scales = tuple(told for case in cases for told in doubts_of_scale(case.name, case.field))
-    notes = (*found.identifiability[:1], *scales, *found.identifiability[1:], *coarse, *longer)
-    result = FieldIdentification(found, body, stated.relative, notes, (*scales, *coarse), inside, cell_of_voxel)
+    doubts = tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
+    notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
+    result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
