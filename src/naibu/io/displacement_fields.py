@@ -40,7 +40,7 @@ _INSTEAD = {
     ".im7": "it is an image of DaVis; export the vectors as Tecplot text (.dat)",
     ".odb": "write positions and U of the nodes as a table (.csv), or as .vtu",
     ".xfm": "write the transform as .tfm or .h5",
-    **dict.fromkeys((".vtk", ".vtp", ".pvtu", ".vti", ".vts", ".xdmf", ".case"), "save it in ParaView as .vtu (Append Datasets makes one of it)"),
+    **dict.fromkeys((".vtk", ".vtp", ".pvtu", ".vti", ".vts", ".xdmf", ".case"), "save it in ParaView as .vtu"),
 }
 
 
@@ -178,7 +178,7 @@ def _mesh(source: Path, unit: str | None) -> DisplacementField:
     vectors = unit_factor(source, name, unit) * values
     if stated:
         sd = unit_factor(source, stated[0], unit) * arrays[stated[0]]
-        measured = np.isfinite(vectors).all(axis=1)
+        measured = np.asarray(np.isfinite(vectors).all(axis=1))
         if sd.shape[1] not in (1, 3) or not (sd[measured] >= 0.0).all():
             raise InputError(f"{source.name}: {stated[0]} must be one or three numbers a point, 0 or more where there is a displacement")
         sd = np.where(measured[:, None], np.broadcast_to(sd, vectors.shape), 0.0)

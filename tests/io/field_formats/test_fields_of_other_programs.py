@@ -158,7 +158,8 @@ def splines(coefficients: np.ndarray) -> str:
     """Return a B-spline transform as text, with coefficients (nz, ny, nx, 3)."""
     numbers = " ".join(map(str, np.moveaxis(coefficients, -1, 0).ravel()))
     fixed = " ".join(map(str, [*coefficients.shape[2::-1], *FIXED[3:]]))
-    return f"#Insight Transform File V1.0\n#Transform 0\nTransform: BSplineTransform_double_3_3\nParameters: {numbers}\nFixedParameters: {fixed}\n"
+    head = "#Insight Transform File V1.0\n#Transform 0\nTransform: BSplineTransform_double_3_3"
+    return f"{head}\nParameters: {numbers}\nFixedParameters: {fixed}\n"
 
 
 def test_b_splines_whose_coefficients_are_linear_are_linear(tmp_path: Path) -> None:

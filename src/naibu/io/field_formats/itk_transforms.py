@@ -4,8 +4,8 @@ The linear transform that ANTs writes beside its warp is in a MATLAB file (``.ma
 
 A transform maps points of the fixed image to the moving one, in LPS and mm: x to x + d(x). Fixed parameters of a displacement field
 transform are size, origin, spacing and direction (row by row); its parameters are the vectors, voxel by voxel, with x fastest. Those of a
-B-spline transform describe its grid of control points in the same way; its parameters are all coefficients along x, then y, then z, of cubic
-B-splines. A composite transform applies its last member first. The formats are described in the ITK Software Guide,
+B-spline transform describe its grid of control points in the same way; its parameters are all coefficients along x, then y, then z, of
+cubic B-splines. A composite transform applies its last member first. The formats are described in the ITK Software Guide,
 https://itk.org/ItkSoftwareGuide.pdf.
 """
 
@@ -58,8 +58,8 @@ def is_text(source: Path) -> bool:
         begin = file.read(4096).decode("utf-8", "replace").lstrip()
     if begin.startswith("(") and "Parameters" in begin:
         raise InputError(
-            f"{source.name}: is a parameter file of elastix; let transformix evaluate it (transformix -def all -tp {source.name}), and take "
-            "its deformationField.mhd"
+            f"{source.name}: is a parameter file of elastix; let transformix evaluate it (transformix -def all -tp {source.name}), and "
+            "take its deformationField.mhd"
         )
     return begin.startswith(_HEAD)
 
@@ -120,8 +120,8 @@ def require_forward_warp(source: Path) -> None:
     if "InverseWarp.nii" in source.name:
         forward = source.name.replace("InverseWarp", "Warp")
         raise InputError(
-            f"{source.name}: leads from the moving image to the fixed one; the displacement of the fixed image's points is in {forward}. If "
-            "the moving image was the reference, register the other way round"
+            f"{source.name}: leads from the moving image to the fixed one; the displacement of the fixed image's points is in {forward}. "
+            "If the moving image was the reference, register the other way round"
         )
 
 
@@ -179,8 +179,8 @@ def _field(source: Path, found: list[_Transform]) -> tuple[FloatArray, Volume]:
     if len(fields) != 1 or found[-1] is not fields[0]:
         raise InputError(
             f"{source.name}: holds {', '.join(kinds) or 'no transform'}; naibu reads one {_FIELD} or {_SPLINES} that is applied first, "
-            "with linear transforms after it: convert the whole to one displacement field (in 3D Slicer: Transforms, Convert; in SimpleITK: "
-            "TransformToDisplacementField)"
+            "with linear transforms after it: convert the whole to one displacement field (in 3D Slicer: Transforms, Convert; in "
+            "SimpleITK: TransformToDisplacementField)"
         )
     vectors, grid = _of_field(source, fields[0]) if fields[0].kind.startswith(_FIELD) else _of_splines(source, fields[0])
     moved = grid.positions() + vectors
@@ -199,7 +199,8 @@ def _of_splines(source: Path, transform: _Transform) -> tuple[FloatArray, Volume
     """Return the displacement at the knots inside the domain: as many vectors as the transform is free to choose there."""
     shape, origin, axes = _stated_grid(source, transform)
     if min(shape) < 4:
-        raise InputError(f"{source.name}: {transform.kind} has {' x '.join(map(str, shape[::-1]))} control points; cubic ones need 4 along each axis")
+        points = " x ".join(map(str, shape[::-1]))
+        raise InputError(f"{source.name}: {transform.kind} has {points} control points; cubic ones need 4 along each axis")
     values = np.moveaxis(transform.parameters.reshape(3, *shape), 0, -1)
     for axis in range(3):
         values = ndimage.convolve1d(values, _AT_KNOT, axis=axis)

@@ -26,7 +26,7 @@ def paper_section(seed: int = 0, *, pixels: int = 256, slices: tuple[int, ...] =
         f"297 are good, it does not say by what measure. Ours are good where they lie within {RIGHT_MM:g} mm of the truth. The search box "
         "begins at the motion of the bone, and grows with the distance from the centre as in the tables above.",
     )
-    note = "256 x 256 x 40 voxels are those of the paper, here without the last of 41 from 21 slices; 57, from 29 slices, is the report's number."
+    note = "40 slices are those of the paper, here the first of 41 from 21 that are scanned; 57, from 29, is the report's number."
     return Section("The paper's matches in volumes", text, (Table("500 points", columns, tuple(rows), caption="Matches.", note=note),))
 
 
