@@ -42,6 +42,7 @@ from naibu.workflows.fields.block_mesh import (
     labelled_object,
     mesh_that_shows,
     misplaced,
+    moved_borders,
     names_of_labels,
     region_in,
     regions_of,
@@ -204,7 +205,8 @@ def identify_fields(
     within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
     found = identify_field(
         mesh, cases, Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell), law=law,
-        bounds=_bounds([young for young, _ in stated.values.values()]), region_at=within, progress=progress,
+        bounds=_bounds([young for young, _ in stated.values.values()]), region_at=within,
+        borders=moved_borders(mesh, inside, labels), progress=progress,
     )  # fmt: skip
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
