@@ -179,7 +179,7 @@ def test_a_step_of_the_surface_in_the_plane_of_a_border_stays(folder: Path) -> N
     mesh, _ = block_mesh(inside, numbers, {1: "gel", 2: "pad"}, 6.7)
     (border,) = moved_borders(mesh, inside, numbers)
     way = np.linalg.norm(border.points - mesh.points, axis=1)
-    x, y, z = inside.to_index(mesh.points).T
+    x, _, z = inside.to_index(mesh.points).T
     plane = np.isclose(z, 11.5)
     np.testing.assert_allclose(way[plane & (x < 12.0)], 1.0)
     assert not way[~plane].any() and not way[x > 12.0].any() and (plane & (x > 12.0)).any()

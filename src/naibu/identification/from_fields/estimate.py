@@ -147,7 +147,8 @@ def identify_field(
     name = automatic if regularization == "automatic" else regularization
     of_map: FieldElements = "as_given" if name is not None and mesh.cell_type == "tetra" else elements
     model = FieldModel(mesh, load_cases, zones, law, of_map)
-    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, region_at if name is None else None, tuple(borders))
+    within = region_at if name is None else None
+    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, within, tuple(borders))
     point = recipe.start(start)
     return recipe.free(point) if name is None else recipe.regularized(point, name, weight, segmented)
 
