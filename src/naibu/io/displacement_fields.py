@@ -28,11 +28,20 @@ from naibu.io.files.reading import guarded_reading, read_bytes, require_plausibl
 from naibu.io.images import read_displacement
 from naibu.io.mesh_formats import vtu
 from naibu.io.tables.point_tables import EXCEL, TEXT
-from naibu.io.tables.table_cells import MM_PER_UNIT
+from naibu.io.tables.table_cells import MM_PER_UNIT, unit_factor, without_unit
 
 FORMAT = "naibu displacement field 1"
 FRAME = "LPS, mm; the material at x in the reference configuration is found at x + vector"
 TABLES = (*TEXT, *EXCEL, ".dat")
+ENDINGS = (".h5", ".mha", ".mhd", ".nrrd", ".nii", ".nii.gz", ".tfm", ".vtu", ".mat", "-Xdisp.tif", *TABLES)
+# what to do with files that are not read, by their ending
+_INSTEAD = {
+    ".vc7": "export the vectors in DaVis as Tecplot text (.dat)",
+    ".im7": "it is an image of DaVis; export the vectors as Tecplot text (.dat)",
+    ".odb": "write positions and U of the nodes as a table (.csv), or as .vtu",
+    ".xfm": "write the transform as .tfm or .h5",
+    **dict.fromkeys((".vtk", ".vtp", ".pvtu", ".vti", ".vts", ".xdmf", ".case"), "save it in ParaView as .vtu"),
+}
 
 
 def write_field(path: str | os.PathLike[str], field: DisplacementField, *, provenance: Mapping[str, Any] | None = None) -> Path:
@@ -120,17 +129,20 @@ def read_field(
     with guarded_reading(path, "displacement field"):
         if ending in (".h5", ".hdf5"):
             return _stored(source)
-        if ending in TABLES:
+        if ending in TABLES and not itk_transforms.is_text(source):
             require_regular(source)
             return field_tables.read(source, unit=unit, spacing_mm=spacing_mm)
         if ending in spam_tiff.ENDINGS:
             return spam_tiff.read(source, spacing_mm=spacing_mm, node_spacing=node_spacing)
         if ending == ".vtu":
-            return _mesh(source, MM_PER_UNIT[unit or "mm"])
+            return _mesh(source, unit)
         if ending == ".mat":
             require_regular(source)
             return _in_voxels(source, *aldvc.read(source), spacing_mm)
-        vectors, grid = itk_transforms.read_tfm(source) if ending == ".tfm" else read_displacement(source)
+        if ending in _INSTEAD:
+            raise InputError(f"{source.name}: is not read; {_INSTEAD[ending]}. Displacement fields are read from {', '.join(ENDINGS)}")
+        itk_transforms.require_forward_warp(source)
+        vectors, grid = itk_transforms.read_tfm(source) if ending in (".tfm", ".txt") else read_displacement(source)
         if (affine := itk_transforms.ants_affine(source)) is not None:
             vectors = itk_transforms.followed_by(affine, vectors, grid)
         return DisplacementField.on_grid(grid, vectors)
@@ -152,16 +164,25 @@ def _require_fitting(
         raise InputError(f"node_spacing goes with TIFF files of SPAM; {source.name} states where its points lie: leave it out")
 
 
-def _mesh(source: Path, unit_mm: float) -> DisplacementField:
+def _mesh(source: Path, unit: str | None) -> DisplacementField:
     """Return the field at the points of a mesh: that of its array of three components, or that whose name says displacement."""
     points, arrays = vtu.read_point_arrays(source.name, read_bytes(source))
-    fitting = {name: values for name, values in arrays.items() if values.shape[1] == 3}
+    stated = [name for name in arrays if re.fullmatch(r"sd|standard[ _]deviation", without_unit(name.lower()))]
+    fitting = {name: values for name, values in arrays.items() if values.shape[1] == 3 and name not in stated}
     named = {name: values for name, values in fitting.items() if re.match(r"disp|u$|deformation$", name.lower())}
     chosen = named or fitting
     if len(chosen) != 1:
         there = ", ".join(arrays) or "none"
         raise InputError(f"{source.name}: needs one array of three components at its points, called displacement; it has {there}")
-    return DisplacementField.from_arrays(unit_mm * points, unit_mm * next(iter(chosen.values())))
+    (name, values), sd = next(iter(chosen.items())), None
+    vectors = unit_factor(source, name, unit) * values
+    if stated:
+        sd = unit_factor(source, stated[0], unit) * arrays[stated[0]]
+        measured = np.asarray(np.isfinite(vectors).all(axis=1))
+        if sd.shape[1] not in (1, 3) or not (sd[measured] >= 0.0).all():
+            raise InputError(f"{source.name}: {stated[0]} must be one or three numbers a point, 0 or more where there is a displacement")
+        sd = np.where(measured[:, None], np.broadcast_to(sd, vectors.shape), 0.0)
+    return DisplacementField.from_arrays(MM_PER_UNIT[unit or "mm"] * points, vectors, sd_mm=sd)
 
 
 def _in_voxels(source: Path, points: FloatArray, vectors: FloatArray, spacing_mm: Sequence[float] | None) -> DisplacementField:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from naibu.identification.lattice_calibration.least_squares import unsettled_covariance
 from naibu.identification.lattice_calibration.local_regression import LocalRegression, regression
 
 COUNT, PRIOR_SD = 2000, 3.0
@@ -69,3 +70,13 @@ def test_an_offset_of_long_steps_is_corrected() -> None:
 def test_what_jumps_alone_move_is_not_determined() -> None:
     _, sd, _ = Jumping(4, [0.0, 1.0], 0.5).estimated()
     assert sd[0] > 0.5
+
+
+def test_where_a_search_did_not_come_to_rest_intervals_hold_what_the_prior_holds() -> None:
+    """However far from the middle of the prior it ended, as in a calibration that ended up to four logarithms away."""
+    rng, centre, prior_sd = np.random.default_rng(0), np.array([0.0, 1.0, -2.0]), 1.2
+    truth = centre + prior_sd * rng.standard_normal((20_000, 3))
+    for away in (0.0, 2.0, 4.0):
+        theta = centre + away
+        half = 1.96 * np.sqrt(np.diag(unsettled_covariance(theta, centre, prior_sd)))
+        assert (np.mean(np.abs(truth - theta) < half, axis=0) > 0.945).all()

@@ -85,6 +85,11 @@ def test_what_lies_beside_a_warp_and_is_no_linear_transform_is_refused(tmp_path:
         read_field(warp)
 
 
+def test_the_inverse_warp_of_ants_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"leads from the moving image to the fixed one.* is in sub1Warp\.nii\.gz"):
+        read_field(nifti(tmp_path / "sub1InverseWarp.nii.gz", VECTORS, 1007))
+
+
 def test_warps_that_mean_something_else_are_refused(tmp_path: Path) -> None:
     for intent, name, words in ((2006, "", "a warp of FSL"), (1007, "NREG_TRANS", "a warp of NiftyReg"), (0, "", "intent 0")):
         with pytest.raises(InputError, match=words):
@@ -147,6 +152,56 @@ def test_a_transform_as_text(tmp_path: Path) -> None:
     path.write_text(f"{head}Transform: DisplacementFieldTransform_double_3_3\nParameters: 1 2 3\nFixedParameters: {fixed}\n")
     with pytest.raises(InputError, match=r"states \[5.0, 4.0, 3.0\] voxels, but has 3 parameters"):
         read_field(path)
+
+
+def splines(coefficients: np.ndarray) -> str:
+    """Return a B-spline transform as text, with coefficients (nz, ny, nx, 3)."""
+    numbers = " ".join(map(str, np.moveaxis(coefficients, -1, 0).ravel()))
+    fixed = " ".join(map(str, [*coefficients.shape[2::-1], *FIXED[3:]]))
+    head = "#Insight Transform File V1.0\n#Transform 0\nTransform: BSplineTransform_double_3_3"
+    return f"{head}\nParameters: {numbers}\nFixedParameters: {fixed}\n"
+
+
+def test_b_splines_whose_coefficients_are_linear_are_linear(tmp_path: Path) -> None:
+    z, y, x = np.indices((5, 6, 7))
+    gradient = np.array([[0.1, 0.02, 0.0], [0.0, -0.05, 0.03], [0.01, 0.0, 0.2]])
+    index = np.stack([x, y, z], axis=-1)
+    (tmp_path / "splines.tfm").write_text(splines(index @ gradient.T))
+    field = read_field(tmp_path / "splines.tfm")
+    inner = index[1:-1, 1:-1, 1:-1]
+    assert field.grid.shape == (3, 4, 5)
+    np.testing.assert_allclose(field.vectors, inner @ gradient.T, atol=1e-12)
+    np.testing.assert_allclose(field.points.reshape(3, 4, 5, 3), ORIGIN + (inner * SPACING) @ DIRECTION.T, atol=1e-12)
+    (tmp_path / "few.tfm").write_text(splines(np.zeros((3, 6, 7, 3))))
+    with pytest.raises(InputError, match="has 7 x 6 x 3 control points; cubic ones need 4"):
+        read_field(tmp_path / "few.tfm")
+
+
+@pytest.mark.parametrize("ending", [".tfm", ".txt", ".h5"])
+def test_b_splines_followed_by_an_affine_transform_are_those_of_itk(tmp_path: Path, ending: str) -> None:
+    sitk = pytest.importorskip("SimpleITK")
+    path = tmp_path / "moved.tfm"
+    path.write_text(splines(np.random.default_rng(1).normal(size=(6, 5, 7, 3))))
+    affine = sitk.AffineTransform([1.02, 0.1, -0.05, 0.03, 0.97, 0.08, -0.02, 0.04, 1.05], (1.0, 2.0, -3.0), (3.0, -4.0, 5.0))
+    whole = sitk.CompositeTransform([affine, sitk.ReadTransform(str(path))])
+    sitk.WriteTransform(whole, str(tmp_path / f"whole{ending}"))
+    field = read_field(tmp_path / f"whole{ending}")
+    at, moved = (a.reshape(4, 3, 5, 3)[1:-1, 1:-1, 1:-1].reshape(-1, 3) for a in (field.points, field.vectors))
+    np.testing.assert_allclose(moved, [np.subtract(whole.TransformPoint(p), p) for p in at], atol=1e-9)
+
+
+def test_files_that_hold_a_field_in_another_way_tell_what_to_do(tmp_path: Path) -> None:
+    for name, content, words in (
+        ("TransformParameters.0.txt", '(Transform "BSplineTransform")\n(NumberOfParameters 3)\n', "transformix -def all"),
+        ("B00001.vc7", "", r"export the vectors in DaVis as Tecplot text \(\.dat\)"),
+        ("solution.vti", "", r"save it in ParaView as \.vtu"),
+    ):
+        (tmp_path / name).write_text(content)
+        with pytest.raises(InputError, match=words):
+            read_field(tmp_path / name)
+    savemat(tmp_path / "itk.mat", {"DisplacementFieldTransform_double_3_3": np.ones(3), "fixed": np.ones(3)}, format="4")
+    with pytest.raises(InputError, match=r"a transform of ITK; write it as \.h5"):
+        read_field(tmp_path / "itk.mat", spacing_mm=(1.0, 1.0, 1.0))
 
 
 def test_spam_counts_in_voxels_and_marks_what_converged(tmp_path: Path) -> None:
@@ -293,6 +348,14 @@ def test_points_of_a_mesh_and_their_displacement(tmp_path: Path) -> None:
         path.write_text(written)
         np.testing.assert_allclose(read_field(path).vectors, MOVED)
     np.testing.assert_allclose(read_field(path, unit="cm").points, 10.0 * POINTS)
+    stated = other.replace('"v"', '"standard_deviation_mm"').replace("-", "")
+    path.write_text(text("displacement_mm", stated))
+    sd = read_field(path).standard_deviation
+    assert sd is not None
+    np.testing.assert_allclose(sd, np.abs(MOVED))
+    path.write_text(text("displacement", stated.replace(">0.1", ">-0.1")))
+    with pytest.raises(InputError, match="standard_deviation_mm must be one or three numbers a point, 0 or more"):
+        read_field(path)
     path.write_text(text("a", other))
     with pytest.raises(InputError, match="needs one array of three components at its points, called displacement; it has a, v"):
         read_field(path)
@@ -304,6 +367,9 @@ def test_points_of_a_mesh_and_their_displacement(tmp_path: Path) -> None:
         "x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm,sd_x_mm,sd_y_mm,sd_z_mm",
         "X [mm],Y [mm],Z [mm],Displacement X [mm],Displacement Y [mm],Displacement Z [mm],sigma_x [mm],sigma_y [mm],sigma_z [mm]",
         "x,y,z,u,v,w,sd_u,sd_v,sd_w",
+        "x,y,z,ux,uy,uz,ux_sd,uy_sd,uz_sd",
+        "x,y,z,ux,uy,uz,se_ux,se_uy,se_uz",
+        "Coor.X,Coor.Y,Coor.Z,Disp.X,Disp.Y,Disp.Z,Error X,Error Y,Error Z",
     ],
 )
 def test_tables_with_standard_deviations(tmp_path: Path, header: str) -> None:
@@ -315,6 +381,39 @@ def test_tables_with_standard_deviations(tmp_path: Path, header: str) -> None:
     np.testing.assert_allclose(field.vectors, MOVED)
     assert field.standard_deviation is not None
     np.testing.assert_allclose(field.standard_deviation, sd)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Points:0,Points:1,Points:2,displacement:0,displacement:1,displacement:2",  # ParaView
+        "Points_0,Points_1,Points_2,displacement_0,displacement_1,displacement_2",
+        "COORD1,COORD2,COORD3,U1,U2,U3",  # Abaqus
+        "X,Y,Z,U-U1,U-U2,U-U3",
+        "X Location (mm),Y Location (mm),Z Location (mm),Directional Deformation X (mm),Directional Deformation Y (mm),"
+        "Directional Deformation Z (mm)",  # Ansys
+        "% x (mm),y (mm),z (mm),u (mm),v (mm),w (mm)",  # COMSOL
+        "x [mm],y [mm],z [mm],Displacement u [mm],Displacement v [mm],Displacement w [mm]",  # DaVis
+    ],
+)
+def test_columns_as_other_programs_name_them(tmp_path: Path, header: str) -> None:
+    shuffled = [4, 0, 2, 5, 1, 3]
+    names, values = header.split(","), np.hstack([POINTS, MOVED])
+    if not header.startswith("%"):
+        names, values = [names[k] for k in shuffled], values[:, shuffled]
+    rows = "\n".join(",".join(map(str, row)) for row in values.tolist())
+    (tmp_path / "field.csv").write_text(f"{','.join(names)}\n{rows}\n")
+    field = read_field(tmp_path / "field.csv")
+    np.testing.assert_allclose(field.points, POINTS)
+    np.testing.assert_allclose(field.vectors, MOVED)
+
+
+def test_one_standard_deviation_is_that_of_every_component(tmp_path: Path) -> None:
+    rows = "\n".join(",".join(map(str, [*p, *u, 20.0])) for p, u in zip(POINTS.tolist(), MOVED.tolist(), strict=True))
+    (tmp_path / "field.csv").write_text(f"x,y,z,ux,uy,uz,sd_um\n{rows}\n")
+    sd = read_field(tmp_path / "field.csv").standard_deviation
+    assert sd is not None
+    np.testing.assert_allclose(sd, np.full((3, 3), 0.02))
 
 
 def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from naibu.viewer.chapters.chapter_page import chapter_numbers, write_chapter
 from naibu.viewer.tables import Table
 
 PAPER = {t["id"]: t["rows"] for t in datasets.paper_tables()["tables"]}
-SIZES = {"pixels": 96, "slices": 15, "plane_points": (100, 120), "space_points": (300, 900), "draws": 1, "paper_slices": (8,)}
+SIZES = {"pixels": 96, "slices": 15, "plane_points": (100, 120), "space_points": (300, 900), "draws": 1, "paper_slices": (15,)}
 within_leg = st.tuples(*[st.floats(-38.0, 38.0)] * 2, st.floats(-28.0, 28.0))
 
 

@@ -185,7 +185,14 @@ def test_noise_biases_least_squares_and_not_the_weighted_balance() -> None:
     assert study.over_bound(study.weighted) < 1.5
     assert study.over_bound(study.plain) > 2.0 * study.over_bound(study.weighted)
     assert noise_study(cube(LAYERS), 0.1, 7, 2).bound == pytest.approx(2.0 * study.bound, rel=1e-6)
-    assert drawn(noise_section(0, 2)) == 1
+
+
+def test_the_sentence_on_the_bound_follows_from_its_table() -> None:
+    section = noise_section(0, 2)
+    assert drawn(section) == 1
+    ratios = [float(str(row[8])) / float(str(row[4])) for row in section.tables[0].rows]
+    assert section.tables[0].columns[4] == "bound" and section.tables[0].columns[7] == "weighted, mean"
+    assert f"{min(ratios):.2f} to {max(ratios):.2f} times the Cramer-Rao bound" in section.paragraphs[1]
 
 
 def test_the_square_has_no_law_for_finite_strain_and_layers_need_fitting_cells() -> None:

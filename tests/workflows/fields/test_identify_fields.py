@@ -23,7 +23,7 @@ from naibu.identification.from_fields.uncertainty import Uncertainty
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
-from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced, sizes_of_voxels
+from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced, moved_borders, sizes_of_voxels
 from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions
 from naibu.workflows.fields.known_zones import parse_known_zones
 
@@ -144,6 +144,45 @@ def test_cells_end_where_zones_meet_in_a_plane(folder: Path) -> None:
             assert labels.to_physical(np.array([0.0, 0.0, first - 0.5]))[2] in heights
             assert 0.5 * size < np.diff(heights).min() and np.diff(heights).max() < 1.6 * size
             assert (cells >= 0).sum() == inside.values.sum()
+
+
+def test_plane_borders_may_lie_anywhere_within_a_voxel(folder: Path) -> None:
+    """What half a voxel is foretold to change is what labels with the border elsewhere give, and is part of the interval."""
+    labels = read_volume(folder / "labels.mha")
+    points, u = solved().at(np.random.default_rng(0).uniform(0.02, 0.98, (1500, 3)))
+    turned, corner = np.asarray(labels.direction), labels.to_physical(np.array([1.5, 1.5, 1.5]))
+    write_field(folder / "exact.h5", DisplacementField.from_arrays(corner + points @ turned.T, u @ turned.T, sd_mm=SD_MM))
+    found = []
+    for first in (11, 12, 13):
+        numbers = labels.values.copy()
+        numbers[2:first, 2:22, 2:22], numbers[first:22, 2:22, 2:22] = 1, 2
+        write_volume(folder / "moved.mha", labels.with_values(numbers))
+        run = identify_fields(
+            folder / "exact.h5", zones=folder / "moved.mha", zone_names={1: "gel", 2: "pad"}, known=["pad=10 kPa, 0.4"], law="linear",
+            element_size_mm=5.0,
+        )  # fmt: skip
+        found.append(run.estimate)
+    half = next(a for a in found[1].assumptions if "border" in a.text)
+    assert half.text == "with the border of 'gel' and 'pad' half a voxel (1 mm) further along z of the grid"
+    assert all(e.mesh_shift is not None for e in found)
+    below, _, above = (float((e.theta - e.mesh_shift)[0]) for e in found)
+    assert half.theta[0] == pytest.approx((above - below) / 4.0, rel=0.2)
+    assert found[1].budget is not None
+    assert found[1].budget.known[0] == pytest.approx(abs(half.theta[0]) / np.sqrt(3.0), rel=1e-6)
+
+
+def test_a_step_of_the_surface_in_the_plane_of_a_border_stays(folder: Path) -> None:
+    labels = read_volume(folder / "labels.mha")
+    numbers = labels.values.astype(np.int64)
+    numbers[12:, :, 16:] = 0  # the pad is narrower than the gel
+    inside = labels.with_values((numbers > 0).astype(np.uint8))
+    mesh, _ = block_mesh(inside, numbers, {1: "gel", 2: "pad"}, 6.7)
+    (border,) = moved_borders(mesh, inside, numbers)
+    way = np.linalg.norm(border.points - mesh.points, axis=1)
+    x, _, z = inside.to_index(mesh.points).T
+    plane = np.isclose(z, 11.5)
+    np.testing.assert_allclose(way[plane & (x < 12.0)], 1.0)
+    assert not way[~plane].any() and not way[x > 12.0].any() and (plane & (x > 12.0)).any()
 
 
 def test_zones_that_end_inside_of_cubes_are_told(folder: Path) -> None:

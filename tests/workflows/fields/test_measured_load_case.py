@@ -11,7 +11,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.workflows.fields.block_mesh import block_mesh
-from naibu.workflows.fields.measured_load_case import doubts_of_scale, measured_load_case
+from naibu.workflows.fields.measured_load_case import doubts_of_field, measured_load_case
 
 SIDE_MM = 40.0
 INSIDE = Volume.from_array(np.ones((20, 20, 20), np.uint8), spacing_mm=(2.0,) * 3, origin_mm=(1.0,) * 3)
@@ -66,11 +66,19 @@ def test_copies_of_a_measurement_count_once() -> None:
 def test_displacements_in_metres_are_doubted_but_small_strain_is_identified(strain: float, told: bool) -> None:
     """A shear of 5 % whose vectors are in metres is one of 5e-5 in mm, which waves in tissue may have as well: it is no error."""
     some = case(POINTS, strain * POINTS[:, [2, 0, 1]])
-    assert [("in metres?" in line) for line in doubts_of_scale(some.name, some.field)] == [True] * told
+    assert [("in metres?" in line) for line in doubts_of_field(some.name, some.field)] == [True] * told
 
 
 def test_a_deformation_below_its_stated_noise_is_doubted() -> None:
     """Standard deviations of .1 mm beside a shear of up to 2 mm, and beside the same in metres."""
     for factor, told in ((1.0, False), (1e-3, True)):
         field = DisplacementField.from_arrays(POINTS, factor * 0.05 * POINTS[:, [2, 0, 1]], sd_mm=0.1)
-        assert any("less than the stated standard deviation" in line for line in doubts_of_scale("push", field)) == told
+        assert any("less than the stated standard deviation" in line for line in doubts_of_field("push", field)) == told
+
+
+@pytest.mark.parametrize(("zeros", "told"), [(4, False), (40, True)])
+def test_points_that_were_not_measured_are_doubted_where_they_are_zero(zeros: int, told: bool) -> None:
+    vectors = 0.05 * POINTS[:, [2, 0, 1]] + 0.01
+    vectors[:zeros] = 0.0
+    lines = doubts_of_field("push", DisplacementField.from_arrays(POINTS, vectors))
+    assert any(f"displacement of {zeros} of 300 points in the object is exactly zero" in line for line in lines) == told

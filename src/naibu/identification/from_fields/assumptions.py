@@ -1,10 +1,11 @@
-"""Sensitivity of identified moduli to what was assumed: the moduli of known regions, and the law.
+"""Sensitivity of identified moduli to what was assumed: the moduli of known regions, where borders lie, and the law.
 
 As for the discretisation (`mesh_error`), the states under another assumption change the residuals, and the best moduli follow.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.identification.from_fields.forward.field_laws import FieldLaw, LawName, field_law
-from naibu.identification.from_fields.forward.forward_model import Solvers, equilibrium
+from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium
 from naibu.identification.from_fields.forward.load_cases import KnownRegion, Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
 from naibu.identification.from_fields.mesh_error import refitted
@@ -53,10 +54,32 @@ class Assumption:
         return np.concatenate([theta[:k] + self.theta[:k], theta[k:] - np.log(less)])
 
 
-def assumptions(at: Linearised, quadratic: Concentrated, law: LawName, stretch: FloatArray) -> tuple[Assumption, ...]:
-    """Return what other moduli of the known regions, and the other law, would do to the result.
+@dataclass(frozen=True, slots=True, eq=False)
+class MovedBorder:
+    """The same cells where a border of regions may lie as well.
 
-    `stretch` (2 count,) is by how much more changes of logarithms are after extrapolation to vanishing element size (see `stretch_of`).
+    Attributes
+    ----------
+    text : str
+        In words, such as ``"with the border of 'pad' 0.25 mm further along z"``.
+    points : ndarray, shape (n, d)
+        Nodes of the mesh then, mm.
+    standard_deviations : float
+        How many standard deviations the border is away from where the mesh has it.
+    """
+
+    text: str
+    points: FloatArray
+    standard_deviations: float
+
+
+def assumptions(
+    at: Linearised, quadratic: Concentrated, law: LawName, stretch: FloatArray, borders: Sequence[MovedBorder] = ()
+) -> tuple[Assumption, ...]:
+    """Return what other moduli of the known regions, borders elsewhere, and the other law would do to the result.
+
+    Borders are moved in meshes on whose own nodes equilibrium is computed, as it is on hexahedra. `stretch` (2 count,) is by how much more
+    changes of logarithms are after extrapolation to vanishing element size (see `stretch_of`).
     """
     model, out = at.model, []
     for number, region in enumerate(model.zones.known):
@@ -67,6 +90,10 @@ def assumptions(at: Linearised, quadratic: Concentrated, law: LawName, stretch: 
             changed = _refitted(at, quadratic, model.law, lame, shear)
             if changed is not None:
                 out.append(Assumption(text, changed, sd))
+    for border in borders if model.computed is model.mesh else ():
+        changed = _with_border(at, quadratic, law, border.points)
+        if changed is not None:
+            out.append(Assumption(border.text, changed, border.standard_deviations))
     if model.mesh.dimension == 3:
         lame, shear = moduli_of(model.zones, at.point.theta)
         other = OTHER_LAW[law]
@@ -77,7 +104,7 @@ def assumptions(at: Linearised, quadratic: Concentrated, law: LawName, stretch: 
 
 
 def covariance_of(found: tuple[Assumption, ...], size: int) -> FloatArray:
-    """Return the covariance (size, size) of theta that stems from the stated uncertainty of known regions."""
+    """Return the covariance (size, size) of theta that stems from the stated uncertainty of known regions and of borders."""
     out = np.zeros((size, size))
     for one in found:
         if one.standard_deviations > 0.0:
@@ -141,6 +168,23 @@ def _refitted(at: Linearised, quadratic: Concentrated, law: FieldLaw, lame: Floa
         for o, u in zip(model.observed, at.point.states, strict=True):
             state, _ = equilibrium(law, solvers, lame, shear, o.load_case, u, b"")
             changes.append(np.asarray(o.operator @ (state - u).ravel()))
+        return refitted(at, quadratic, changes).theta
+    except ConvergenceError:
+        return None
+
+
+def _with_border(at: Linearised, quadratic: Concentrated, law: LawName, points: FloatArray) -> FloatArray | None:
+    """Return the change (2 count,) of theta when the nodes of the mesh lie elsewhere; None where there is no equilibrium."""
+    model = at.model
+    mesh = replace(model.mesh, points=points)
+    body = field_law(mesh, law, averaged=model.averaged)
+    lame, shear = moduli_of(model.zones, at.point.theta)
+    solvers, changes = Solvers(body, points), []
+    try:
+        for o, u in zip(model.observed, at.point.states, strict=True):
+            on = Observed.of(mesh, mesh, o.load_case)
+            state, _ = equilibrium(body, solvers, lame, shear, on.load_case, u, b"")
+            changes.append(on.residual(state) - o.residual(u))
         return refitted(at, quadratic, changes).theta
     except ConvergenceError:
         return None

@@ -21,7 +21,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
-from naibu.identification.from_fields.assumptions import assumptions, covariance_of, effects
+from naibu.identification.from_fields.assumptions import MovedBorder, assumptions, covariance_of, effects
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
@@ -95,6 +95,7 @@ def identify_field(
     start: tuple[FloatArray, FloatArray] | None = None,
     elements: FieldElements = "accurate",
     region_at: RegionAt | None = None,
+    borders: Sequence[MovedBorder] = (),
     progress: Progress | None = None,
 ) -> FieldEstimate:
     """Find the moduli of zones from displacement fields measured in one or more load cases, no force being known.
@@ -127,6 +128,8 @@ def identify_field(
     region_at : callable, optional
         Number of the region of `mesh` at points (k, d), mm, negative outside of the body: where zones that are named in `zones` end inside
         of cells, what this changes is found on the mesh of half the element size, and corrected for. Maps do not use it.
+    borders : sequence of MovedBorder
+        Where borders of regions may lie as well; becomes part of the intervals, each by itself.
     progress : callable, optional
         Gets a report after every step, its stage in words (`naibu.core.progress`); the same words are in `FieldEstimate.steps`.
 
@@ -144,7 +147,8 @@ def identify_field(
     name = automatic if regularization == "automatic" else regularization
     of_map: FieldElements = "as_given" if name is not None and mesh.cell_type == "tetra" else elements
     model = FieldModel(mesh, load_cases, zones, law, of_map)
-    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, region_at if name is None else None)
+    within = region_at if name is None else None
+    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, within, tuple(borders))
     point = recipe.start(start)
     return recipe.free(point) if name is None else recipe.regularized(point, name, weight, segmented)
 
@@ -161,6 +165,7 @@ class _Recipe:
     steps: list[str]
     progress: Progress | None
     region_at: RegionAt | None
+    borders: tuple[MovedBorder, ...]
 
     def record(self, text: str, objective: float | None = None) -> None:
         """Keep a step in words, and report it."""
@@ -361,7 +366,7 @@ class _Recipe:
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders))
         on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
-        others = assumptions(at, quadratic, self.law, stretch)
+        others = assumptions(at, quadratic, self.law, stretch, self.borders)
         of_known = covariance_of(others, len(theta))
         of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
         thin = () if self.region_at is None or corrected is not None else one_cell_thick(model.mesh)

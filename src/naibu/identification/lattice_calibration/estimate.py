@@ -35,7 +35,7 @@ class LatticeEstimate:
     finished : bool
         Whether the search came to its end; otherwise Ctrl-C left the best so far.
     settled : bool
-        Whether it came to rest there; otherwise the covariance is that of the weak prior.
+        Whether it came to rest there; otherwise the covariance holds what the weak prior holds.
     """
 
     unknowns: Unknowns

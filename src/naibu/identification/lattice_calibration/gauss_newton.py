@@ -30,6 +30,7 @@ from naibu.identification.lattice_calibration.least_squares import (
     covariance_at,
     noise_factors,
     step_within,
+    unsettled_covariance,
 )
 from naibu.identification.lattice_calibration.local_regression import LocalRegression
 from naibu.identification.lattice_calibration.mapped_search import MappedSearch
@@ -280,10 +281,10 @@ def _searched_by_mapping(
     search.run(most, reweigh=reweigh)
     local = LocalRegression(problem, search.theta, centre, prior_sd, at)
     point, covariance = local.run()
-    if not local.settled:  # derivatives there say nothing of where the least misfit is
-        covariance = prior_sd**2 * np.eye(len(centre))
-    found = _estimate(problem, point, covariance, search.iterations + local.rounds, at.runs)
     information = np.linalg.inv(covariance) - np.eye(len(centre)) / prior_sd**2
+    if not local.settled:  # derivatives there say nothing of where the least misfit is
+        covariance, information = unsettled_covariance(point.theta, centre, prior_sd), np.zeros_like(covariance)
+    found = _estimate(problem, point, covariance, search.iterations + local.rounds, at.runs)
     open_combinations = identifiability(problem.unknowns.names, information)
     return replace(found, information=information, undetermined=open_combinations, settled=local.settled)
 

@@ -115,3 +115,12 @@ def noise_factors(problem: InverseProblem, residual: Residual) -> tuple[float, f
     """Return root mean squares of the residuals of points and forces in units of the stated noise; 0 of what there is none of."""
     rms = [float(np.sqrt((r**2).mean())) if len(r) else 0.0 for r in residual]
     return rms[0] * problem.excess[0], rms[1] * problem.excess[1]
+
+
+def unsettled_covariance(theta: FloatArray, centre: FloatArray, prior_sd: float) -> FloatArray:
+    """Return the covariance (p, p) of logarithms about a point that the data say nothing of: second moments of the prior about it.
+
+    A search that did not come to rest may have ended far from the centre of the prior; intervals around where it ended must still hold what
+    the prior holds.
+    """
+    return np.diag(prior_sd**2 + (theta - centre) ** 2)

@@ -32,6 +32,8 @@ def read(source: Path) -> tuple[FloatArray, FloatArray]:
     displacement, mesh = stored.get("ResultDisp"), stored.get("DVCmesh", stored.get("ResultFEMesh"))
     if displacement is None or mesh is None:
         there = ", ".join(name for name in stored if not name.startswith("__")) or "nothing"
+        if "_3_3" in there:
+            raise InputError(f"{source.name}: holds {there[:200]}, a transform of ITK; write it as .h5 or .tfm")
         raise InputError(
             f"{source.name}: is no result of ALDVC: it lacks {'ResultDisp' if displacement is None else 'DVCmesh'}, and has {there[:200]}; "
             "save points and displacements of other programs as a table"

@@ -1,10 +1,12 @@
-"""Displacement field transforms of ITK: ``.h5`` (also of ANTs and 3D Slicer, with linear transforms after them) and text (``.tfm``).
+"""Deformable transforms of ITK: ``.h5`` (also of ANTs and 3D Slicer, with linear transforms after them) and text (``.tfm``, ``.txt``).
 
 The linear transform that ANTs writes beside its warp is in a MATLAB file (``.mat``, version 4).
 
 A transform maps points of the fixed image to the moving one, in LPS and mm: x to x + d(x). Fixed parameters of a displacement field
-transform are size, origin, spacing and direction (row by row); its parameters are the vectors, voxel by voxel, with x fastest. A composite
-transform applies its last member first. The formats are described in the ITK Software Guide, https://itk.org/ItkSoftwareGuide.pdf.
+transform are size, origin, spacing and direction (row by row); its parameters are the vectors, voxel by voxel, with x fastest. Those of a
+B-spline transform describe its grid of control points in the same way; its parameters are all coefficients along x, then y, then z, of
+cubic B-splines. A composite transform applies its last member first. The formats are described in the ITK Software Guide,
+https://itk.org/ItkSoftwareGuide.pdf.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
+from scipy import ndimage
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
@@ -22,7 +25,10 @@ from naibu.io.files.reading import guarded_reading, read_bytes, require_plausibl
 from naibu.io.image_formats.geometry import volume_with_axes
 
 GROUP = "TransformGroup"
+_FIELD, _SPLINES = "DisplacementFieldTransform", "BSplineTransform"
+_AT_KNOT = (1.0 / 6.0, 4.0 / 6.0, 1.0 / 6.0)  # cubic B-splines of a control point and its neighbours
 _LINEAR = ("AffineTransform", "MatrixOffsetTransformBase")
+_HEAD = "#Insight Transform File"
 _TYPO = ("Transform", "Tranform")  # names of datasets before ITK 4.13 lack a letter
 
 
@@ -37,13 +43,34 @@ def is_transform(root: Any) -> bool:
     return GROUP in root
 
 
+def is_text(source: Path) -> bool:
+    """Return whether a file ``.txt`` is no table, but holds ITK transforms.
+
+    Raises
+    ------
+    InputError
+        It is a parameter file of elastix.
+    """
+    if source.suffix.lower() != ".txt":
+        return False
+    require_regular(source)
+    with source.open("rb") as file:
+        begin = file.read(4096).decode("utf-8", "replace").lstrip()
+    if begin.startswith("(") and "Parameters" in begin:
+        raise InputError(
+            f"{source.name}: is a parameter file of elastix; let transformix evaluate it (transformix -def all -tp {source.name}), and "
+            "take its deformationField.mhd"
+        )
+    return begin.startswith(_HEAD)
+
+
 def read_h5(source: Path, root: Any) -> tuple[FloatArray, Volume]:
     """Return vectors (nz, ny, nx, 3), mm, and their grid, of a file that is open.
 
     Raises
     ------
     InputError
-        Transforms that are not one displacement field, followed by linear ones at most.
+        Transforms that are not one displacement field, or one of B-splines, followed by linear ones at most.
     """
     group = root[GROUP]
     found = []
@@ -63,11 +90,11 @@ def read_tfm(source: Path) -> tuple[FloatArray, Volume]:
     Raises
     ------
     InputError
-        No ITK transform, or transforms that are not one displacement field, followed by linear ones at most.
+        No ITK transform, or transforms that are not one displacement field, or one of B-splines, followed by linear ones at most.
     """
     text = read_bytes(source).decode("utf-8", "replace")
-    if not text.startswith("#Insight Transform File"):
-        raise InputError(f"{source.name}: is no text file of ITK transforms: its first line is not '#Insight Transform File V1.0'")
+    if not text.startswith(_HEAD):
+        raise InputError(f"{source.name}: is no text file of ITK transforms: its first line is not '{_HEAD} V1.0'")
     found: list[_Transform] = []
     for line in text.splitlines():
         name, colon, value = line.partition(":")
@@ -80,6 +107,22 @@ def read_tfm(source: Path) -> tuple[FloatArray, Volume]:
             last = found.pop()
             found.append(last._replace(parameters=numbers) if name.strip() == "Parameters" else last._replace(fixed=numbers))
     return _field(source, [t for t in found if not t.kind.startswith("CompositeTransform")])
+
+
+def require_forward_warp(source: Path) -> None:
+    """Refuse the inverse warp of ANTs, ``PREFIX1InverseWarp.nii.gz``.
+
+    Raises
+    ------
+    InputError
+        It is one: its vectors lead from the moving image back to the fixed one, after the inverse of the linear transform.
+    """
+    if "InverseWarp.nii" in source.name:
+        forward = source.name.replace("InverseWarp", "Warp")
+        raise InputError(
+            f"{source.name}: leads from the moving image to the fixed one; the displacement of the fixed image's points is in {forward}. "
+            "If the moving image was the reference, register the other way round"
+        )
 
 
 def ants_affine(source: Path) -> Path | None:
@@ -132,13 +175,14 @@ def _numbers(source: Path, name: str, text: str) -> FloatArray:
 
 def _field(source: Path, found: list[_Transform]) -> tuple[FloatArray, Volume]:
     kinds = [t.kind for t in found]
-    fields = [t for t in found if t.kind.startswith("DisplacementFieldTransform")]
+    fields = [t for t in found if t.kind.startswith((_FIELD, _SPLINES))]
     if len(fields) != 1 or found[-1] is not fields[0]:
         raise InputError(
-            f"{source.name}: holds {', '.join(kinds) or 'no transform'}; naibu reads one DisplacementFieldTransform that is applied first, "
-            "with linear transforms after it: convert the whole to one displacement field (TransformToDisplacementField)"
+            f"{source.name}: holds {', '.join(kinds) or 'no transform'}; naibu reads one {_FIELD} or {_SPLINES} that is applied first, "
+            "with linear transforms after it: convert the whole to one displacement field (in 3D Slicer: Transforms, Convert; in "
+            "SimpleITK: TransformToDisplacementField)"
         )
-    vectors, grid = _of_field(source, fields[0])
+    vectors, grid = _of_field(source, fields[0]) if fields[0].kind.startswith(_FIELD) else _of_splines(source, fields[0])
     moved = grid.positions() + vectors
     for transform in reversed(found[:-1]):
         moved = _linear(source, transform, moved)
@@ -146,16 +190,34 @@ def _field(source: Path, found: list[_Transform]) -> tuple[FloatArray, Volume]:
 
 
 def _of_field(source: Path, transform: _Transform) -> tuple[FloatArray, Volume]:
+    shape, origin, axes = _stated_grid(source, transform)
+    grid = volume_with_axes(source.name, np.zeros(shape, dtype=bool), origin, axes)
+    return transform.parameters.reshape(*shape, 3), grid
+
+
+def _of_splines(source: Path, transform: _Transform) -> tuple[FloatArray, Volume]:
+    """Return the displacement at the knots inside the domain: as many vectors as the transform is free to choose there."""
+    shape, origin, axes = _stated_grid(source, transform)
+    if min(shape) < 4:
+        points = " x ".join(map(str, shape[::-1]))
+        raise InputError(f"{source.name}: {transform.kind} has {points} control points; cubic ones need 4 along each axis")
+    values = np.moveaxis(transform.parameters.reshape(3, *shape), 0, -1)
+    for axis in range(3):
+        values = ndimage.convolve1d(values, _AT_KNOT, axis=axis)
+    inner = values[1:-1, 1:-1, 1:-1]
+    grid = volume_with_axes(source.name, np.zeros(inner.shape[:3], dtype=bool), origin + axes.sum(axis=1), axes)
+    return np.ascontiguousarray(inner), grid
+
+
+def _stated_grid(source: Path, transform: _Transform) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
+    """Return shape (nz, ny, nx), origin, and the steps along x, y and z as columns (3, 3), mm."""
     fixed, values = transform.fixed, transform.parameters
     if "_3_3" not in transform.kind or len(fixed) != 18:
         raise InputError(f"{source.name}: {transform.kind} has {len(fixed)} fixed parameters; one of three dimensions has 18")
     size = fixed[:3]
     if not (np.isfinite(fixed).all() and (size >= 1).all() and (size == np.round(size)).all() and size.prod() * 3 == len(values)):
         raise InputError(f"{source.name}: states {size.tolist()} voxels, but has {len(values)} parameters, not three a voxel")
-    shape = tuple(int(n) for n in size[::-1])
-    axes = fixed[9:].reshape(3, 3) * fixed[6:9]
-    grid = volume_with_axes(source.name, np.zeros(shape, dtype=bool), fixed[3:6], axes)
-    return values.reshape(*shape, 3), grid
+    return tuple(int(n) for n in size[::-1]), fixed[3:6], fixed[9:].reshape(3, 3) * fixed[6:9]
 
 
 def _linear(source: Path, transform: _Transform, points: FloatArray) -> FloatArray:

@@ -14,27 +14,31 @@ from naibu.core.errors import InputError
 from naibu.io.tables.table_cells import HEADER_WITHIN, decimal_mark, excel_rows, number, text_rows, unit_factor, without_unit
 
 TEXT, EXCEL = (".csv", ".tsv", ".txt"), (".xlsx",)
-_PLACE = r"(?:pos(?:ition)?|coord(?:inate)?s?|centroid|cent(?:er|re)|points?)?"
-_MOVED = r"(?:disp(?:l|lacement)?s?|u|d|v)"
-_SD = r"(?:sd|std|sigma|stdev|uncertainty)"
+_PLACE = r"(?:pos(?:ition)?|coor(?:d(?:inate)?s?)?|centroid|cent(?:er|re)|points?|location)?"
+_DISPLACEMENT = r"disp(?:l|lacement)?s?"
+_MOVED = rf"(?:{_DISPLACEMENT}|delta|(?:directional\s)?deformation|u|d|v)"
+_SD = r"(?:sd|std|std[\s_.]?dev|stdev|std[\s_.]?err|sigma|se|err(?:or)?|uncertainty|standard[\s_](?:deviation|error))"
 _GAP = r"[\s_.:-]*"
 
 
-def _patterns(axis: str, component: str) -> dict[str, re.Pattern[str]]:
+def _patterns(number: int, axis: str, component: str) -> dict[str, re.Pattern[str]]:
+    # ParaView counts components from 0 (Points:0, displacement_0), Abaqus from 1 (COORD1, U1, U-U1)
     texts = {
-        "points": rf"{_PLACE}{_GAP}{axis}{_GAP}{_PLACE}",
-        "vectors": rf"{component}|{_MOVED}{_GAP}{axis}|{axis}{_GAP}(?:disp(?:l|lacement)?s?)",
-        "sd": rf"{_SD}{_GAP}[ud]?{_GAP}(?:{axis}|(?<=[\s_.:-]){component})|(?:{axis}|{component}){_GAP}{_SD}",
+        "points": rf"{_PLACE}{_GAP}{axis}{_GAP}{_PLACE}|points?[:_]{number}|coord?{number + 1}",
+        "vectors": rf"{component}|{_MOVED}{_GAP}{axis}|{axis}{_GAP}{_DISPLACEMENT}|{_DISPLACEMENT}{_GAP}{component}"
+        rf"|(?:{_DISPLACEMENT}|u)[:_]{number}|(?:u{_GAP})?u{number + 1}",
+        "sd": rf"{_SD}{_GAP}{_MOVED}?{_GAP}(?:{axis}|(?<=[\s_.:-]){component})|(?:{_MOVED}?{_GAP}{axis}|{component}){_GAP}{_SD}",
     }
     return {name: re.compile(text, re.IGNORECASE) for name, text in texts.items()}
 
 
+_ONE_SD = re.compile(rf"(?:sd|uncertainty)(?:{_GAP}(?:u|{_DISPLACEMENT}))?", re.IGNORECASE)  # of each component
 # columns that say which points were measured: SPAM's (2: converged), DaVis's
 _STATUS: tuple[tuple[re.Pattern[str], Callable[[FloatArray], BoolArray]], ...] = (
     (re.compile(r"returnStatus|(?:SubPix)?ReturnStat", re.IGNORECASE), lambda status: status == 2),
     (re.compile(r"is[\s_]?valid", re.IGNORECASE), lambda status: status > 0.5),
 )
-COLUMNS = {axis: _patterns(axis, component) for axis, component in zip("xyz", "uvw", strict=True)}
+COLUMNS = {axis: _patterns(k, axis, component) for k, (axis, component) in enumerate(zip("xyz", "uvw", strict=True))}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,12 +145,20 @@ def columns_of(names: list[str], what: str) -> dict[str, list[int]]:
     found: dict[str, list[int]] = {name: [] for name in _WORDS}
     for name, columns in found.items():
         for axis, patterns in COLUMNS.items():
-            fitting = [at for at, cell in enumerate(names) if patterns[name].fullmatch(without_unit(cell).strip())]
+            fitting = [at for at, cell in enumerate(names) if patterns[name].fullmatch(_plain(cell))]
             if len(fitting) > 1:
                 both = " and ".join(repr(names[at]) for at in fitting[:2])
                 raise InputError(f"{what}: both {both} may be the {axis} of {_WORDS[name]}; rename one of them")
             columns += fitting
+    if found["vectors"] and not found["sd"]:
+        single = [at for at, cell in enumerate(names) if _ONE_SD.fullmatch(_plain(cell))]
+        found["sd"] = single * len(found["points"]) if len(single) == 1 else []
     return found
+
+
+def _plain(name: str) -> str:
+    """Return the name of a column without its unit, and without the mark of a comment before the first one."""
+    return without_unit(name).strip().lstrip("%#").strip()
 
 
 def _header(path: Path, rows: list[tuple[int, list[str]]]) -> tuple[int, dict[str, list[int]]]:

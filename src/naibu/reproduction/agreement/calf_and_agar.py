@@ -18,7 +18,7 @@ def of_chapter1(tables: Tables) -> tuple[Comparison, ...]:
     default, floor = (
         tables.number(volumes, (way,), "RMS (1.29), intensity levels") for way in ("ours, naibu's default", "true displacement")
     )
-    shares = [tables.number(many, row, "good, %") for row in (("paper",), ("ours, direction26", "256 x 256 x 39"))]
+    shares = [tables.number(many, row, "good, %") for row in (("paper",), ("ours, direction26", "256 x 256 x 40"))]
     printed, follows = (tables.number(points, ("paper, TPA",), name) for name in ("printed RMSE, cm", "RMS, cm"))
     return (
         Comparison(

@@ -90,7 +90,7 @@ def chapter1(
     draws : int
         Realisations of noise, for the table of matches under noise.
     paper_slices : tuple of int
-        Scanned slices of the volumes in which the paper's 500 points are matched.
+        Slices, with the interpolated ones, of the volumes in which the paper's 500 points are matched.
     """
     calf = examined(calf_case(seed, pixels=pixels, slices=slices), plane_points, space_points)
     sections = (

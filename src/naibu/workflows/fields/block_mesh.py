@@ -13,8 +13,10 @@ from naibu.core.arrays import AnyArray, FloatArray, IntArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
+from naibu.identification.from_fields.assumptions import MovedBorder
 from naibu.io.images import read_volume
 from naibu.meshing.primitives import grid_cells
+from naibu.meshing.surface import boundary_faces
 
 CELLS = 1200  # by default
 BLURRED = 0.01  # part of the object that cubes may misrepresent without a word
@@ -27,6 +29,7 @@ SMALLER, MOST_BY_DEFAULT = 0.85, 5000  # steps of the size of cells, and how man
 NARROWEST = 0.3  # of a cell, in edge lengths, between such planes
 WHOLE_VOXELS = 1.000001  # of a stated edge length: lengths of voxels are rounded in headers
 HALF_FILLED = 0.5  # part of a cell that must lie in the object
+UNIFORM = 3.0**0.5  # standard deviations from the middle of a voxel to its end, of a place that is anywhere in it
 
 
 def labelled_object(mask: str | os.PathLike[str] | None, zones: str | os.PathLike[str] | None) -> tuple[Volume, IntArray]:
@@ -154,18 +157,49 @@ def block_mesh(inside: Volume, labels: IntArray, names: Mapping[int, str], eleme
 def _edges(inside: Volume, labels: IntArray, axis: int, low: int, high: int, size_mm: float) -> FloatArray:
     """Return where cells begin and end along an axis, in voxels from `low`: at plane borders of zones, and evenly between them."""
     width = size_mm / float(inside.spacing_mm[axis])
-    here, there = (np.moveaxis(a, 2 - axis, 0)[low:high] for a in (inside.values != 0, labels))
-    both = here[1:] & here[:-1]
-    across = both & (there[1:] != there[:-1])
-    pairs, changes = both.sum(axis=(1, 2)), across.sum(axis=(1, 2))
-    planes = np.flatnonzero(changes > PLANE * np.maximum(pairs, 1)) + 1
     fixed = [0]
-    for plane in planes.tolist():
+    for plane in (_planes(inside, labels, axis) - low).tolist():
         if plane - fixed[-1] >= NARROWEST * width and high - low - plane >= NARROWEST * width:
             fixed.append(plane)
     fixed.append(high - low)
     parts = [np.linspace(a, b, int(np.clip(np.round((b - a) / width), 1, b - a)), endpoint=False) for a, b in pairwise(fixed)]
     return np.append(np.concatenate(parts), float(high - low))
+
+
+def _planes(inside: Volume, labels: IntArray, axis: int) -> IntArray:
+    """Return the first voxel behind every plane of the grid normal to an axis in which zones meet."""
+    here, there = (np.moveaxis(a, 2 - axis, 0) for a in (inside.values != 0, labels))
+    both = here[1:] & here[:-1]
+    across = both & (there[1:] != there[:-1])
+    pairs, changes = both.sum(axis=(1, 2)), across.sum(axis=(1, 2))
+    return np.asarray(np.flatnonzero(changes > PLANE * np.maximum(pairs, 1)) + 1)
+
+
+def moved_borders(mesh: Mesh, inside: Volume, labels: IntArray) -> tuple[MovedBorder, ...]:
+    """Return the mesh of `block_mesh` with each plane border of zones half a voxel further.
+
+    Labels say to a voxel where a border lies. Where it runs across the grid, what they round differs from voxel to voxel and hardly moves
+    the whole; in a plane of the grid it is the same everywhere, and may be anything up to half a voxel.
+    """
+    index, out = inside.to_index(mesh.points), []
+    surface = boundary_faces(mesh).faces
+    lowest, highest = np.full(mesh.n_points, len(mesh.region_names)), np.full(mesh.n_points, -1)
+    np.minimum.at(lowest, mesh.cells, mesh.regions[:, None])
+    np.maximum.at(highest, mesh.cells, mesh.regions[:, None])
+    for axis in range(3):
+        for plane in _planes(inside, labels, axis).tolist():
+            within = np.abs(index[:, axis] - (plane - 0.5)) < 1e-6
+            nodes = within & (lowest != highest)
+            nodes[surface[within[surface].all(axis=1)]] = False  # where a step of the surface lies in the plane
+            if not nodes.any():
+                continue
+            moved = index.copy()
+            moved[nodes, axis] += 0.5
+            meeting = np.unique(mesh.regions[nodes[mesh.cells].any(axis=1)])
+            names = " and ".join(repr(mesh.region_names[region]) for region in meeting)
+            way = f"half a voxel ({0.5 * inside.spacing_mm[axis]:.2g} mm) further along {'xyz'[axis]} of the grid"
+            out.append(MovedBorder(f"with the border of {names} {way}", inside.to_physical(moved), UNIFORM))
+    return tuple(out)
 
 
 def mesh_that_shows(

@@ -44,6 +44,7 @@ from naibu.workflows.fields.block_mesh import (
     labelled_object,
     mesh_that_shows,
     misplaced,
+    moved_borders,
     names_of_labels,
     region_in,
     regions_of,
@@ -51,7 +52,7 @@ from naibu.workflows.fields.block_mesh import (
 )
 from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, parse_known_zones
-from naibu.workflows.fields.measured_load_case import doubts_of_scale, measured_load_case, relative_deformation
+from naibu.workflows.fields.measured_load_case import doubts_of_field, measured_load_case, relative_deformation
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 
@@ -216,7 +217,10 @@ def identify_fields(
     bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])
     if stated.values:
         sought_zones = Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative)
-        found = identify_field(mesh, cases, sought_zones, law=law, bounds=bounds, region_at=within, progress=progress)
+        found = identify_field(
+            mesh, cases, sought_zones, law=law, bounds=bounds, region_at=within, borders=moved_borders(mesh, inside, labels),
+            progress=progress,
+        )  # fmt: skip
     else:
         found = identify_relative_map(mesh, cases, law=law, bounds=bounds, progress=progress)
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
@@ -226,10 +230,10 @@ def identify_fields(
         region_at=within,
     )  # fmt: skip
     coarse = blurred(left_out, wrong, corrected=within is not None and found.mesh_shift is not None)
-    scales = tuple(told for case in cases for told in doubts_of_scale(case.name, case.field))
+    doubts = tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
     coarse += tuple(UNRESOLVED.format(case.name, 100 * part) for case, part in coarser if part > 0.0)
-    notes = (*found.identifiability[:1], *scales, *found.identifiability[1:], *coarse, *longer)
-    result = FieldIdentification(found, body, stated.relative, notes, (*scales, *coarse), inside, cell_of_voxel)
+    notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
+    result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 

@@ -20,6 +20,7 @@ FEWEST_POINTS = 20
 THINNEST = 0.1  # of a cell: points that span less along a direction do not tell how displacements change along it
 MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
 LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
+ZERO = 5, 0.01  # points, and part of them, with a displacement of exactly zero: no measurement is that by chance
 TINY_DEFORMATION = 1e-4  # so little is usual for waves and interferometry, and for scans and particles is a sign of another unit
 
 
@@ -101,8 +102,8 @@ def relative_deformation(field: DisplacementField) -> float:
     return float(np.sqrt((left**2).sum(axis=1).mean()) / np.linalg.norm(np.ptp(points, axis=0)))
 
 
-def doubts_of_scale(name: str, field: DisplacementField) -> tuple[str, ...]:
-    """Say what speaks for displacements in another unit than mm; nothing is refused, since small strains may well be measured.
+def doubts_of_field(name: str, field: DisplacementField) -> tuple[str, ...]:
+    """Say what speaks for displacements in another unit than mm, or for zeros where nothing was measured; either may be right as it is.
 
     Parameters
     ----------
@@ -127,6 +128,12 @@ def doubts_of_scale(name: str, field: DisplacementField) -> tuple[str, ...]:
                 f"{name}: the object deforms by {deformed:.2g} mm RMS, less than the stated standard deviation of its vectors, {sd:.2g} "
                 "mm: only what many of them share tells its moduli. Are displacements and standard deviations in one unit?"
             )
+    zero, count = int((field.vectors[field.valid] == 0.0).all(axis=1).sum()), int(field.valid.sum())
+    if zero >= max(ZERO[0], ZERO[1] * count):
+        told.append(
+            f"{name}: the displacement of {zero} of {count} points in the object is exactly zero, which programs write where they measured "
+            "nothing: leave these points out. Only of what a simulation holds fast it is right."
+        )
     return tuple(told)
 
 

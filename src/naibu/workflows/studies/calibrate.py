@@ -278,8 +278,8 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
     if not estimate.settled:
         found.append(
             "The search did not come to rest: long and short steps of time differ by more than the noise, or contacts jump between "
-            "sticking and sliding. Intervals are those of the weak prior, as if nothing "
-            "were known; begin nearer (the calibrated study), or identify fewer parameters."
+            "sticking and sliding. Intervals hold what the weak prior holds, as if "
+            "nothing were known; begin nearer (the calibrated study), or identify fewer parameters."
         )
     for what, factor in zip(("points", "forces"), estimate.noise_factor, strict=True):
         if factor > 1.3:
