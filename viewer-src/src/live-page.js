@@ -21,6 +21,10 @@ const HINTS = {
 const AXES = ["x", "y", "z"];
 const DEAD_ZONE = 0.15;
 const TURN = 0.1; // rad, of a key
+const STEP = 0.02; // of the object's size, of a key
+const REPEAT_MS = 250; // after which a key that is held moves the tool on
+const SPEED = 0.3; // of the object's size a second, of such a key
+const LEASH = 0.25; // of the object's size, by which keys and sticks lead the tool at most
 const PAD_TURN = 0.03; // rad, of a frame in which the stick is held
 const WHEEL_TURN = 0.001; // rad, of a pixel
 const WRITE_MS = 100; // from one reading of the numbers to the next
@@ -34,6 +38,7 @@ class LivePage {
     this.scene = scene;
     this.mode = "push";
     this.probed = -1;
+    this.held = new Map(); // keys that lead the tool
     this.written = this.curved = -Infinity; // times at which numbers were written and curves drawn, ms
     this.tool = scene.tools.length ? scene.tools[0].name : "";
     this.#build(root);
@@ -107,10 +112,24 @@ class LivePage {
 
   #keys() {
     const moves = { w: ["up", 1], s: ["up", -1], d: ["right", 1], a: ["right", -1], q: ["away", 1], e: ["away", -1] };
-    const keys = Object.fromEntries(Object.entries(moves).map(([key, [axis, sign]]) => [key, () => this.nudge(axis, sign * 0.02)]));
+    const keys = Object.fromEntries(Object.entries(moves).map(([key, [axis, sign]]) => [key, () => this.#press(key, axis, sign)]));
     const turns = { z: ["away", -1], x: ["away", 1], c: ["right", -1], v: ["right", 1], f: ["up", -1], g: ["up", 1] };
     Object.entries(turns).forEach(([key, [axis, sign]]) => { keys[key] = () => this.turn(axis, sign * TURN); });
     return { ...keys, " ": () => this.command("pause", { on: !this.frame?.paused }), u: () => this.back("undo") };
+  }
+
+  /** A key begins to lead the tool: by a step, and on while it is held; repetitions of the keyboard, which come in jerks, do not count. */
+  #press(key, axis, sign) {
+    if (this.held.has(key)) return;
+    this.held.set(key, { axis, sign, since: performance.now() });
+    this.nudge(axis, sign * STEP);
+  }
+
+  /** Lead the tool on by the keys that are held, at a speed that does not depend on the keyboard nor on the rate of the frames. */
+  #hold(now) {
+    const seconds = Math.min(now - (this.moved ?? now), 100) / 1000;
+    this.moved = now;
+    for (const { axis, sign, since } of this.held.values()) if (now - since > REPEAT_MS) this.nudge(axis, sign * SPEED * seconds);
   }
 
   /** Send a command; those that steer are not sent by a page that only watches. */
@@ -149,9 +168,11 @@ class LivePage {
   nudge(axis, fraction) {
     if (!this.frame || this.frame.tool < 0) return;
     const way = this.view.screenAxes()[axis];
-    const step = fraction * 2 * this.view.extent.radius;
-    const from = this.lead ?? this.frame.centre;
-    this.lead = from.map((v, k) => v + step * way[k]);
+    const size = 2 * this.view.extent.radius;
+    const { centre } = this.frame;
+    const ahead = (this.lead ?? centre).map((v, k) => v + fraction * size * way[k] - centre[k]);
+    const share = Math.min(1, (LEASH * size) / Math.max(Math.hypot(...ahead), 1e-9)); // a tool that is held back comes back at once
+    this.lead = centre.map((v, k) => v + share * ahead[k]);
     this.command("move", { at: this.lead });
   }
 
@@ -163,6 +184,8 @@ class LivePage {
 
   #listen() {
     const { stage, view } = this;
+    stage.addEventListener("keyup", (e) => this.held.delete(e.key.toLowerCase()));
+    stage.addEventListener("blur", () => this.held.clear());
     stage.addEventListener("wheel", (e) => {
       if (!e.altKey) return;
       e.preventDefault();
@@ -256,6 +279,7 @@ class LivePage {
     if (first && frame.driving && this.tool && frame.tool < 0) this.take(this.tool);
     this.view.setFrame(frame);
     this.#gamepad();
+    this.#hold(performance.now());
     this.curve.add(frame.time, [[newtons(frame.gripped >= 0 ? frame.pull : frame.force), NaN, NaN]]);
     this.plots.add(frame.time, frame.readings);
     this.#markProbed();
@@ -312,6 +336,7 @@ class LivePage {
     const real = Math.round(100 * frame.realTime);
     let text = real >= 97 ? "real time" : `slower than real time: ${real} %`;
     if (frame.unbalanced > UNBALANCED) text += `; forces out of balance by ${Math.round(100 * frame.unbalanced)} %`;
+    if (frame.held) text += "; the body is crushed before the tool, which is held back";
     if (frame.paused) text = "paused";
     if (frame.replaying) text = "replay";
     if (frame.failed) text = "the last step failed and was taken back";

@@ -119,6 +119,31 @@ def test_keys_wheel_and_gamepad_move_and_turn_the_tool(tmp_path: Path) -> None:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_key_that_is_held_leads_the_tool_until_the_body_holds_it_back(tmp_path: Path) -> None:
+    with served() as (address, _), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value("naibuLive.view.look('front'); document.querySelector('.stage').focus()")
+        before = page.value("naibuLive.frame.centre")
+        page.key("s")  # a tap is one step
+        page.wait(f"naibuLive.frame.centre[2] < {before[2]} - 0.5", 30)
+        page.key_event("keyDown", "s")  # held, without repetitions
+        page.wait("naibuLive.badge.textContent.includes('the body is crushed before the tool, which is held back')", 60)
+        time.sleep(1.0)
+        assert page.value("naibuLive.frame.force[2]") < -100.0
+        assert page.value("naibuLive.frame.centre[2]") > 10.0
+        page.picture(tmp_path / "held.png")
+        page.key_event("keyUp", "s")
+        page.key_event("keyDown", "w")  # back at once, however long the other key was held
+        page.wait("naibuLive.frame.force.every((f) => f === 0) && !naibuLive.frame.held", 10)
+        page.key_event("keyUp", "w")
+        still = "new Promise((done) => setTimeout(() => done(naibuLive.frame.centre[2]), 1000))"
+        page.value(still)
+        assert page.value(still) == page.value(still)
+        assert page.console == []
+
+
 def pieces(simulation: LiveSimulation) -> int:
     scene = simulation.scene
     ends = np.concatenate([scene.cells[:, 0]] * 3), scene.cells[:, 1:].T.ravel()
