@@ -18,6 +18,12 @@ const HINTS = {
   cut: "Draw a line across the object: the blade cuts through it, away from you. Begin beside it to cut in from its rim; a line that ends where it began cuts a piece out.",
   probe: "Click a point of the surface to follow its displacement.",
 };
+const TOUCH_HINTS = {
+  push: "Drag the tool with a finger. Drag elsewhere to rotate; two fingers zoom.",
+  pull: "Drag a point of the surface; it is released when you let go. Drag elsewhere to rotate; two fingers zoom.",
+  cut: HINTS.cut,
+  probe: "Tap a point of the surface to follow its displacement.",
+};
 const AXES = ["x", "y", "z"];
 const DEAD_ZONE = 0.15;
 const TURN = 0.1; // rad, of a key
@@ -39,10 +45,12 @@ class LivePage {
     this.mode = "push";
     this.probed = -1;
     this.held = new Map(); // keys that lead the tool
+    this.touched = window.matchMedia("(pointer: coarse)"); // a screen that fingers touch, without keys
     this.written = this.curved = -Infinity; // times at which numbers were written and curves drawn, ms
     this.tool = scene.tools.length ? scene.tools[0].name : "";
     this.#build(root);
     this.view = new LiveView(this.stage);
+    this.stage.append(this.readout);
     this.view.show(scene);
     this.view.listenToKeys(this.#keys());
     this.curve = new TimeCurve(this.canvas, "force (N)");
@@ -75,6 +83,7 @@ class LivePage {
       h("option", { value: "displacement" }, "displacement, mm"), h("option", { value: "strain" }, this.scene.strain));
     this.badge = h("p", { class: "badge", role: "status" }, "connecting");
     this.message = h("p", { class: "note trouble", role: "alert" });
+    this.readout = h("p", { class: "readout", "aria-hidden": "true" }); // where the numbers are too far below to be seen
     this.canvas = h("canvas", { class: "time-curve", role: "img", "aria-label": "Force of the last ten seconds" });
     this.numbers = Object.fromEntries(["force", "pull", "penetration", "time", "rate", "probe"].map((name) => [name, h("dd", {}, "–")]));
     this.plots = new ReadingPlots(this.scene.readings);
@@ -83,12 +92,12 @@ class LivePage {
     root.replaceChildren(
       h("div", { class: "bar" }, h("div", { class: "modes", role: "group", "aria-label": "What dragging does" }, ...this.modes),
         h("span", { class: "pair" }, h("label", { for: "naibu-tool" }, "Tool"), this.toolChoice), this.pause, this.#button("↺ Undo", () => this.back("undo")),
-        this.#button("Reset", () => this.back("reset"))),
+        this.#button("Reset", () => this.back("reset")), this.#button("Whole view", () => this.view.look("oblique"))),
       h("div", { class: "live-grid" },
         h("div", {}, this.stage, this.hint, h("div", { class: "motion-scale" }, this.gradient, this.ticks), this.#viewControls()),
         h("div", { class: "live-side" }, this.badge, this.message, list, this.canvas,
           h("div", { class: "bar" }, this.record, this.#button("▶ Replay", () => this.command("replay")),
-            this.#button("Save as a page", () => { window.location.href = `/recording${window.location.search}`; }),
+            this.#button("Save as a page", () => this.#save()),
             this.#button("Screenshot", () => this.#screenshot())))),
       ...(this.scene.readings.length ? [this.plots.element] : []));
   }
@@ -161,7 +170,7 @@ class LivePage {
   setMode(mode) {
     this.mode = mode;
     this.modes.forEach((b) => b.setAttribute("aria-pressed", String(b.dataset.mode === mode)));
-    this.hint.textContent = HINTS[mode];
+    this.hint.textContent = (this.touched.matches ? TOUCH_HINTS : HINTS)[mode];
   }
 
   /** Move the tool along an axis of the screen by a fraction of the object's size. */
@@ -298,14 +307,18 @@ class LivePage {
     if (now - this.written < WRITE_MS) return;
     this.written = now;
     const unit = frame.values ? this.scene.strain.split(", ").at(-1) : "mm";
-    const scaled = `${this.view.top} ${unit}`;
+    const { top, signed } = this.view;
+    const scaled = `${top} ${signed} ${unit}`;
     if (this.scaled !== scaled) {
-      this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits((k / 4) * this.view.top) + (k === 4 ? ` ${unit}` : ""))));
+      const at = signed ? [-1, -0.5, 0, 0.5, 1] : [0, 0.25, 0.5, 0.75, 1];
+      this.ticks.replaceChildren(...at.map((share, k) => h("span", {}, digits(share * top) + (k === 4 ? ` ${unit}` : ""))));
     }
     this.scaled = scaled;
     const { numbers } = this;
     numbers.force.textContent = frame.tool < 0 ? "–" : `${newtons(frame.force).toFixed(2)} N`;
     numbers.pull.textContent = frame.gripped < 0 ? "–" : `${newtons(frame.pull).toFixed(2)} N`;
+    const shown = frame.gripped < 0 ? numbers.force.textContent : numbers.pull.textContent;
+    this.readout.textContent = shown === "–" ? "" : shown;
     numbers.penetration.textContent = `${frame.penetration.toFixed(2)} mm`;
     numbers.time.textContent = `${frame.time.toFixed(2)} s`;
     numbers.rate.textContent = `${Math.round(frame.stepsPerSecond)} steps/s, ${this.link.framesPerSecond} frames/s`;
@@ -349,7 +362,10 @@ class LivePage {
   }
 
   #probe() {
-    if (this.probed < 0 || !this.frame) return;
+    if (this.probed < 0 || !this.frame) {
+      this.numbers.probe.textContent = "–";
+      return;
+    }
     const [points, moved] = [this.scene.points, this.frame.positions];
     const d = [0, 1, 2].map((a) => moved[3 * this.probed + a] - points[3 * this.probed + a]);
     const signed = d.map((v) => v.toFixed(2).replace("-", "−"));
@@ -376,11 +392,25 @@ class LivePage {
 
   #screenshot() {
     this.view.renderFinest();
-    this.view.canvas.toBlob((blob) => {
-      const link = h("a", { href: URL.createObjectURL(blob), download: "naibu-live.png" });
-      link.click();
-      URL.revokeObjectURL(link.href);
-    });
+    this.view.canvas.toBlob((blob) => this.#download(blob, "naibu-live.png"));
+  }
+
+  /** Save the recorded motion as a page, or say why there is none: a link would lead away from this page. */
+  async #save() {
+    this.#say("");
+    try {
+      const answer = await fetch(`/recording${window.location.search}`);
+      if (answer.ok) this.#download(await answer.blob(), "naibu-recording.html");
+      else this.#say(await answer.text());
+    } catch {
+      this.#say("the simulation does not answer");
+    }
+  }
+
+  #download(blob, name) {
+    const link = h("a", { href: URL.createObjectURL(blob), download: name });
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   }
 }
 
