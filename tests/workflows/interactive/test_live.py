@@ -214,7 +214,7 @@ def test_on_a_phone_one_finger_pushes_and_two_look_closer(tmp_path: Path) -> Non
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 def test_a_point_is_probed_until_the_body_is_another_and_shortened_elements_are_told_from_lengthened_ones(tmp_path: Path) -> None:
-    with served() as (address, simulation), opened_browser() as page:
+    with served() as (address, _), opened_browser() as page:
         page.open(address)
         page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
         page.value("naibuLive.command('move', {at: [20, 20, 36]}); naibuLive.command('colour', {name: 'strain'}, true)")
