@@ -14,7 +14,7 @@ from naibu.mechanics import Assembler, elements, material, plane_indenter, spher
 from naibu.mechanics.contact.rigid_indenters import box_indenter, capsule_indenter, cylindrical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, InteractiveBody, InteractiveSimulation
-from naibu.simulation.crushed_cells import CrushedCells, least_principal_stretches
+from naibu.simulation.crushed_cells import CrushedCells
 from naibu.simulation.held_tool import CRUSHED, outside_planes
 from naibu.simulation.tool_places import placed
 from naibu.workflows import tools_for
@@ -23,11 +23,22 @@ TURNED = rotation_matrix(np.array([0.4, -0.9, 0.3]))
 
 
 def test_least_principal_stretches_are_singular_values() -> None:
+    """Of single tetrahedra under random deformation gradients, and of all of them together."""
     rng = np.random.default_rng(1)
-    special = [np.eye(3), 2.0 * TURNED, TURNED @ np.diag([1.0, 1.0, 0.2]), np.zeros((3, 3))]
-    gradients = np.concatenate([rng.normal(size=(500, 3, 3)), special])
+    special = [np.eye(3), 2.0 * TURNED, TURNED @ np.diag([1.0, 1.0, 0.2]), np.zeros((3, 3)), -np.eye(3)]
+    gradients = np.concatenate([rng.normal(size=(300, 3, 3)), special])
     expected = np.linalg.svd(gradients, compute_uv=False)[:, 2] * np.where(np.linalg.det(gradients) < 0.0, -1.0, 1.0)
-    np.testing.assert_allclose(least_principal_stretches(gradients), expected, atol=1e-7)
+    rest = np.array([[0.0, 0, 0], [3, 0, 0.5], [0.4, 2, 0], [0.3, 0.2, 2.5]])
+    cells = CrushedCells.of(rest, np.array([[0, 1, 2, 3]]))
+    found = [cells.least_stretch(rest @ gradient.T, 0)[0] for gradient in gradients]
+    np.testing.assert_allclose(found, expected, atol=1e-7)
+    points = np.concatenate([rest + 10.0 * k for k in range(len(gradients))])
+    many = CrushedCells.of(points, np.arange(len(points)).reshape(-1, 4))
+    moved = np.concatenate([rest @ gradient.T for gradient in gradients])
+    least, place = many.least_stretch(moved, 0)
+    assert least == pytest.approx(expected.min(), abs=1e-7)
+    np.testing.assert_allclose(place, (rest @ gradients[expected.argmin()].T).mean(axis=0), atol=1e-9)
+    assert many.least_stretch(points, 0, 0.6) == (0.6, pytest.approx(np.zeros(3)))
 
 
 def test_slivers_are_left_out() -> None:
@@ -95,7 +106,7 @@ def test_a_tool_that_keys_press_down_for_ever_is_held_by_the_body(kind: str, too
     frame = touched.last
     assert frame.held
     assert frame.tool_centre[2] > 0.3 * TOP
-    cells = CrushedCells.of(body.points, body.cells, 1)
+    cells = CrushedCells.of(body.points, body.cells)
     assert -0.05 < cells.least_stretch(frame.positions, 0)[0] < 0.3  # as far as it goes, and hardly farther
     assert frame.penetration_mm < touched.tools[tool].geometry.inradius  # the surface has not passed the middle of the tool
     rest = led(touched, np.tile(start - (0.0, 0.0, 80.0), (60, 1)))
@@ -164,6 +175,6 @@ def test_where_steps_are_shown_one_by_one_a_press_is_held_as_well() -> None:
     start = touched.advance().tool_centre
     led(touched, start - np.outer(0.15 * np.arange(500), (0.0, 0.0, 1.0)))
     assert touched.last.held and touched.last.force[2] < 0.0
-    cells = CrushedCells.of(body.points, body.cells, 1)
+    cells = CrushedCells.of(body.points, body.cells)
     assert 0.5 * CRUSHED - 0.1 < cells.least_stretch(touched.last.positions, 0)[0] < 0.3
     assert touched.last.tool_centre[2] > 0.3 * TOP

@@ -24,7 +24,7 @@ SHARE = 0.5  # of the way that is left, in the time in which all cells are looke
 FADE = 0.9  # of the rate of crushing, from one look at all cells to the next
 AT_FIRST = 2.0  # rate of crushing before one was seen, over the extent of the body
 LEAST_ADVANCE = 1e-3  # of the extent of the body, from which on an advance shows a rate
-MOST_CELLS = 4000  # looked at in a frame
+MOST_CELLS = 10_000  # looked at in a frame
 BACK = 0.5  # cosine of the angle to the force of the body from which on a tool goes back, and freely
 HELD_BELOW = 0.5  # of the way that is wanted: a tool that goes less is said to be held back
 
@@ -82,7 +82,9 @@ class HeldTool:
         """Return what holds a tool back from a body of which all cells are looked at in a time, s, or in more where there are many."""
         parts = max(round(look_s / frame_s), -(-len(body.cells) // MOST_CELLS), 1)
         extent = float(np.ptp(body.points, axis=0).max())
-        return cls(CrushedCells.of(body.points, body.cells, parts), extent)
+        cells = CrushedCells.of(body.points, body.cells, parts)
+        cells.least_stretch(body.points, 0, WATCHED)  # compiled before the first contact
+        return cls(cells, extent)
 
     @property
     def crushed(self) -> bool:
@@ -115,7 +117,7 @@ class HeldTool:
             self._least, self._before, self._seen, self._part, self._advanced, self._rate = WATCHED, WATCHED, np.inf, 0, 0.0, 0.0
             return
         self._advanced += max(self._advance(centre - way, way, force), 0.0)
-        found, place = self.cells.least_stretch(positions, self._part)
+        found, place = self.cells.least_stretch(positions, self._part, WATCHED)
         if found < self._seen:
             self._seen, self._next_place = found, place
         self._part += 1
