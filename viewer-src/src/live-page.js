@@ -31,7 +31,8 @@ const STEP = 0.02; // of the object's size, of a key
 const REPEAT_MS = 250; // after which a key that is held moves the tool on
 const SPEED = 0.3; // of the object's size a second, of such a key
 const LEASH = 0.25; // of the object's size, by which keys and sticks lead the tool at most
-const PAD_TURN = 0.03; // rad, of a frame in which the stick is held
+const PAD_SPEED = 0.6; // of the object's size a second, of a stick that is held
+const PAD_TURN = 1.8; // rad a second, of such a stick
 const WHEEL_TURN = 0.001; // rad, of a pixel
 const WRITE_MS = 100; // from one reading of the numbers to the next
 const CURVE_MS = 50; // from one drawing of the curves to the next
@@ -134,10 +135,11 @@ class LivePage {
     this.nudge(axis, sign * STEP);
   }
 
-  /** Lead the tool on by the keys that are held, at a speed that does not depend on the keyboard nor on the rate of the frames. */
+  /** Lead the tool on by keys and sticks that are held, at a speed that does not depend on the keyboard nor on the rate of the frames. */
   #hold(now) {
     const seconds = Math.min(now - (this.moved ?? now), 100) / 1000;
     this.moved = now;
+    this.#gamepad(seconds);
     for (const { axis, sign, since } of this.held.values()) if (now - since > REPEAT_MS) this.nudge(axis, sign * SPEED * seconds);
   }
 
@@ -267,14 +269,14 @@ class LivePage {
     this.#followed(follow, () => { if (kind === "pull") this.command("release"); });
   }
 
-  #gamepad() {
+  #gamepad(seconds) {
     const pad = navigator.getGamepads?.().find(Boolean);
     if (!pad) return;
     const axes = [["right", pad.axes[0]], ["up", -pad.axes[1]], ["away", -(pad.axes[3] ?? 0)]];
-    axes.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.nudge(axis, 0.01 * value));
+    axes.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.nudge(axis, PAD_SPEED * seconds * value));
     const held = (k) => Number(pad.buttons?.[k]?.pressed ?? false);
     const turns = [["away", pad.axes[2] ?? 0], ["right", held(5) - held(4)], ["up", held(7) - held(6)]];
-    turns.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.turn(axis, PAD_TURN * value));
+    turns.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.turn(axis, PAD_TURN * seconds * value));
   }
 
   #show(frame) {
@@ -287,7 +289,6 @@ class LivePage {
     this.frame = frame;
     if (first && frame.driving && this.tool && frame.tool < 0) this.take(this.tool);
     this.view.setFrame(frame);
-    this.#gamepad();
     this.#hold(performance.now());
     this.curve.add(frame.time, [[newtons(frame.gripped >= 0 ? frame.pull : frame.force), NaN, NaN]]);
     this.plots.add(frame.time, frame.readings);
