@@ -75,9 +75,10 @@ class Page:
         """Go to an address."""
         self.call("Page.navigate", url=address)
 
-    def resize(self, width: int, height: int) -> None:
-        """Set the size of the window, CSS pixels."""
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
+    def resize(self, width: int, height: int, *, scale: float = 1.0) -> None:
+        """Set the size of the window, CSS pixels, and the pixels of the screen for one of them; narrow ones are those of a phone."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=width < 600)
+        self.call("Emulation.setTouchEmulationEnabled", enabled=width < 600, maxTouchPoints=5)
 
     def dark(self, on: bool = True) -> None:
         """Ask for the dark colours."""
@@ -90,7 +91,16 @@ class Page:
     def key(self, key: str) -> None:
         """Press and release a key."""
         for kind in ("keyDown", "keyUp"):
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" and len(key) == 1 else "")
+            self.key_event(kind, key)
+
+    def key_event(self, kind: str, key: str) -> None:
+        """Send ``keyDown`` or ``keyUp`` of a key."""
+        self.call("Input.dispatchKeyEvent", type=kind, key=key, text=key if kind == "keyDown" and len(key) == 1 else "")
+
+    def touch(self, kind: str, *points: tuple[float, float]) -> None:
+        """Send ``touchStart``, ``touchMove`` or ``touchEnd`` with the fingers that are on the screen then."""
+        fingers = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(points)]
+        self.call("Input.dispatchTouchEvent", type=kind, touchPoints=fingers)
 
     def picture(self, path: Path) -> Path:
         """Save what the window shows as PNG."""

@@ -18,10 +18,21 @@ const HINTS = {
   cut: "Draw a line across the object: the blade cuts through it, away from you. Begin beside it to cut in from its rim; a line that ends where it began cuts a piece out.",
   probe: "Click a point of the surface to follow its displacement.",
 };
+const TOUCH_HINTS = {
+  push: "Drag the tool with a finger. Drag elsewhere to rotate; two fingers zoom.",
+  pull: "Drag a point of the surface; it is released when you let go. Drag elsewhere to rotate; two fingers zoom.",
+  cut: HINTS.cut,
+  probe: "Tap a point of the surface to follow its displacement.",
+};
 const AXES = ["x", "y", "z"];
 const DEAD_ZONE = 0.15;
 const TURN = 0.1; // rad, of a key
-const PAD_TURN = 0.03; // rad, of a frame in which the stick is held
+const STEP = 0.02; // of the object's size, of a key
+const REPEAT_MS = 250; // after which a key that is held moves the tool on
+const SPEED = 0.3; // of the object's size a second, of such a key
+const LEASH = 0.25; // of the object's size, by which keys and sticks lead the tool at most
+const PAD_SPEED = 0.6; // of the object's size a second, of a stick that is held
+const PAD_TURN = 1.8; // rad a second, of such a stick
 const WHEEL_TURN = 0.001; // rad, of a pixel
 const WRITE_MS = 100; // from one reading of the numbers to the next
 const CURVE_MS = 50; // from one drawing of the curves to the next
@@ -34,10 +45,13 @@ class LivePage {
     this.scene = scene;
     this.mode = "push";
     this.probed = -1;
+    this.held = new Map(); // keys that lead the tool
+    this.touched = window.matchMedia("(pointer: coarse)"); // a screen that fingers touch, without keys
     this.written = this.curved = -Infinity; // times at which numbers were written and curves drawn, ms
     this.tool = scene.tools.length ? scene.tools[0].name : "";
     this.#build(root);
     this.view = new LiveView(this.stage);
+    this.stage.append(this.readout);
     this.view.show(scene);
     this.view.listenToKeys(this.#keys());
     this.curve = new TimeCurve(this.canvas, "force (N)");
@@ -70,6 +84,7 @@ class LivePage {
       h("option", { value: "displacement" }, "displacement, mm"), h("option", { value: "strain" }, this.scene.strain));
     this.badge = h("p", { class: "badge", role: "status" }, "connecting");
     this.message = h("p", { class: "note trouble", role: "alert" });
+    this.readout = h("p", { class: "readout", "aria-hidden": "true" }); // where the numbers are too far below to be seen
     this.canvas = h("canvas", { class: "time-curve", role: "img", "aria-label": "Force of the last ten seconds" });
     this.numbers = Object.fromEntries(["force", "pull", "penetration", "time", "rate", "probe"].map((name) => [name, h("dd", {}, "–")]));
     this.plots = new ReadingPlots(this.scene.readings);
@@ -78,12 +93,12 @@ class LivePage {
     root.replaceChildren(
       h("div", { class: "bar" }, h("div", { class: "modes", role: "group", "aria-label": "What dragging does" }, ...this.modes),
         h("span", { class: "pair" }, h("label", { for: "naibu-tool" }, "Tool"), this.toolChoice), this.pause, this.#button("↺ Undo", () => this.back("undo")),
-        this.#button("Reset", () => this.back("reset"))),
+        this.#button("Reset", () => this.back("reset")), this.#button("Whole view", () => this.view.look("oblique"))),
       h("div", { class: "live-grid" },
         h("div", {}, this.stage, this.hint, h("div", { class: "motion-scale" }, this.gradient, this.ticks), this.#viewControls()),
         h("div", { class: "live-side" }, this.badge, this.message, list, this.canvas,
           h("div", { class: "bar" }, this.record, this.#button("▶ Replay", () => this.command("replay")),
-            this.#button("Save as a page", () => { window.location.href = `/recording${window.location.search}`; }),
+            this.#button("Save as a page", () => this.#save()),
             this.#button("Screenshot", () => this.#screenshot())))),
       ...(this.scene.readings.length ? [this.plots.element] : []));
   }
@@ -107,10 +122,25 @@ class LivePage {
 
   #keys() {
     const moves = { w: ["up", 1], s: ["up", -1], d: ["right", 1], a: ["right", -1], q: ["away", 1], e: ["away", -1] };
-    const keys = Object.fromEntries(Object.entries(moves).map(([key, [axis, sign]]) => [key, () => this.nudge(axis, sign * 0.02)]));
+    const keys = Object.fromEntries(Object.entries(moves).map(([key, [axis, sign]]) => [key, () => this.#press(key, axis, sign)]));
     const turns = { z: ["away", -1], x: ["away", 1], c: ["right", -1], v: ["right", 1], f: ["up", -1], g: ["up", 1] };
     Object.entries(turns).forEach(([key, [axis, sign]]) => { keys[key] = () => this.turn(axis, sign * TURN); });
     return { ...keys, " ": () => this.command("pause", { on: !this.frame?.paused }), u: () => this.back("undo") };
+  }
+
+  /** A key begins to lead the tool: by a step, and on while it is held; repetitions of the keyboard, which come in jerks, do not count. */
+  #press(key, axis, sign) {
+    if (this.held.has(key)) return;
+    this.held.set(key, { axis, sign, since: performance.now() });
+    this.nudge(axis, sign * STEP);
+  }
+
+  /** Lead the tool on by keys and sticks that are held, at a speed that does not depend on the keyboard nor on the rate of the frames. */
+  #hold(now) {
+    const seconds = Math.min(now - (this.moved ?? now), 100) / 1000;
+    this.moved = now;
+    this.#gamepad(seconds);
+    for (const { axis, sign, since } of this.held.values()) if (now - since > REPEAT_MS) this.nudge(axis, sign * SPEED * seconds);
   }
 
   /** Send a command; those that steer are not sent by a page that only watches. */
@@ -142,16 +172,18 @@ class LivePage {
   setMode(mode) {
     this.mode = mode;
     this.modes.forEach((b) => b.setAttribute("aria-pressed", String(b.dataset.mode === mode)));
-    this.hint.textContent = HINTS[mode];
+    this.hint.textContent = (this.touched.matches ? TOUCH_HINTS : HINTS)[mode];
   }
 
   /** Move the tool along an axis of the screen by a fraction of the object's size. */
   nudge(axis, fraction) {
     if (!this.frame || this.frame.tool < 0) return;
     const way = this.view.screenAxes()[axis];
-    const step = fraction * 2 * this.view.extent.radius;
-    const from = this.lead ?? this.frame.centre;
-    this.lead = from.map((v, k) => v + step * way[k]);
+    const size = 2 * this.view.extent.radius;
+    const { centre } = this.frame;
+    const ahead = (this.lead ?? centre).map((v, k) => v + fraction * size * way[k] - centre[k]);
+    const share = Math.min(1, (LEASH * size) / Math.max(Math.hypot(...ahead), 1e-9)); // a tool that is held back comes back at once
+    this.lead = centre.map((v, k) => v + share * ahead[k]);
     this.command("move", { at: this.lead });
   }
 
@@ -163,6 +195,8 @@ class LivePage {
 
   #listen() {
     const { stage, view } = this;
+    stage.addEventListener("keyup", (e) => this.held.delete(e.key.toLowerCase()));
+    stage.addEventListener("blur", () => this.held.clear());
     stage.addEventListener("wheel", (e) => {
       if (!e.altKey) return;
       e.preventDefault();
@@ -235,14 +269,14 @@ class LivePage {
     this.#followed(follow, () => { if (kind === "pull") this.command("release"); });
   }
 
-  #gamepad() {
+  #gamepad(seconds) {
     const pad = navigator.getGamepads?.().find(Boolean);
     if (!pad) return;
     const axes = [["right", pad.axes[0]], ["up", -pad.axes[1]], ["away", -(pad.axes[3] ?? 0)]];
-    axes.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.nudge(axis, 0.01 * value));
+    axes.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.nudge(axis, PAD_SPEED * seconds * value));
     const held = (k) => Number(pad.buttons?.[k]?.pressed ?? false);
     const turns = [["away", pad.axes[2] ?? 0], ["right", held(5) - held(4)], ["up", held(7) - held(6)]];
-    turns.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.turn(axis, PAD_TURN * value));
+    turns.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.turn(axis, PAD_TURN * seconds * value));
   }
 
   #show(frame) {
@@ -255,7 +289,7 @@ class LivePage {
     this.frame = frame;
     if (first && frame.driving && this.tool && frame.tool < 0) this.take(this.tool);
     this.view.setFrame(frame);
-    this.#gamepad();
+    this.#hold(performance.now());
     this.curve.add(frame.time, [[newtons(frame.gripped >= 0 ? frame.pull : frame.force), NaN, NaN]]);
     this.plots.add(frame.time, frame.readings);
     this.#markProbed();
@@ -274,14 +308,18 @@ class LivePage {
     if (now - this.written < WRITE_MS) return;
     this.written = now;
     const unit = frame.values ? this.scene.strain.split(", ").at(-1) : "mm";
-    const scaled = `${this.view.top} ${unit}`;
+    const { top, signed } = this.view;
+    const scaled = `${top} ${signed} ${unit}`;
     if (this.scaled !== scaled) {
-      this.ticks.replaceChildren(...[0, 1, 2, 3, 4].map((k) => h("span", {}, digits((k / 4) * this.view.top) + (k === 4 ? ` ${unit}` : ""))));
+      const at = signed ? [-1, -0.5, 0, 0.5, 1] : [0, 0.25, 0.5, 0.75, 1];
+      this.ticks.replaceChildren(...at.map((share, k) => h("span", {}, digits(share * top) + (k === 4 ? ` ${unit}` : ""))));
     }
     this.scaled = scaled;
     const { numbers } = this;
     numbers.force.textContent = frame.tool < 0 ? "–" : `${newtons(frame.force).toFixed(2)} N`;
     numbers.pull.textContent = frame.gripped < 0 ? "–" : `${newtons(frame.pull).toFixed(2)} N`;
+    const shown = frame.gripped < 0 ? numbers.force.textContent : numbers.pull.textContent;
+    this.readout.textContent = shown === "–" ? "" : shown;
     numbers.penetration.textContent = `${frame.penetration.toFixed(2)} mm`;
     numbers.time.textContent = `${frame.time.toFixed(2)} s`;
     numbers.rate.textContent = `${Math.round(frame.stepsPerSecond)} steps/s, ${this.link.framesPerSecond} frames/s`;
@@ -312,6 +350,7 @@ class LivePage {
     const real = Math.round(100 * frame.realTime);
     let text = real >= 97 ? "real time" : `slower than real time: ${real} %`;
     if (frame.unbalanced > UNBALANCED) text += `; forces out of balance by ${Math.round(100 * frame.unbalanced)} %`;
+    if (frame.held) text += "; the body is crushed before the tool, which is held back";
     if (frame.paused) text = "paused";
     if (frame.replaying) text = "replay";
     if (frame.failed) text = "the last step failed and was taken back";
@@ -324,7 +363,10 @@ class LivePage {
   }
 
   #probe() {
-    if (this.probed < 0 || !this.frame) return;
+    if (this.probed < 0 || !this.frame) {
+      this.numbers.probe.textContent = "–";
+      return;
+    }
     const [points, moved] = [this.scene.points, this.frame.positions];
     const d = [0, 1, 2].map((a) => moved[3 * this.probed + a] - points[3 * this.probed + a]);
     const signed = d.map((v) => v.toFixed(2).replace("-", "−"));
@@ -351,11 +393,25 @@ class LivePage {
 
   #screenshot() {
     this.view.renderFinest();
-    this.view.canvas.toBlob((blob) => {
-      const link = h("a", { href: URL.createObjectURL(blob), download: "naibu-live.png" });
-      link.click();
-      URL.revokeObjectURL(link.href);
-    });
+    this.view.canvas.toBlob((blob) => this.#download(blob, "naibu-live.png"));
+  }
+
+  /** Save the recorded motion as a page, or say why there is none: a link would lead away from this page. */
+  async #save() {
+    this.#say("");
+    try {
+      const answer = await fetch(`/recording${window.location.search}`);
+      if (answer.ok) this.#download(await answer.blob(), "naibu-recording.html");
+      else this.#say(await answer.text());
+    } catch {
+      this.#say("the simulation does not answer");
+    }
+  }
+
+  #download(blob, name) {
+    const link = h("a", { href: URL.createObjectURL(blob), download: name });
+    link.click();
+    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
   }
 }
 

@@ -15,6 +15,7 @@ import { readTheme, View } from "./view.js";
 
 const MARKER_FRACTION = 0.012; // radius of a marker, in radii of the object
 const SEEN_PX = 0.05; // motion below this is not drawn
+const NEGATIVE = 0.05; // of the largest value, from which on negative ones count
 const SEEN_COLOUR = 1 / 512; // nor is a change of a value, of the scale
 
 /** Whether WebGL is drawn by the processor, as where there is no graphics card. */
@@ -190,7 +191,7 @@ export class LiveView extends View {
   #setLevels({ positions: moved, values }) {
     const { points } = this.scene;
     const out = this.level.array;
-    let largest = 0;
+    let [largest, smallest] = [0, 0];
     for (let i = 0; i < out.length; i += 1) {
       let value;
       if (values) value = values[i];
@@ -202,10 +203,15 @@ export class LiveView extends View {
       }
       out[i] = value;
       if (value > largest) largest = value;
+      else if (value < smallest) smallest = value;
     }
+    const most = Math.max(largest, -smallest);
     // the scale grows at once and shrinks only when it is three times too long, so that colours do not flicker
-    if (largest > this.top || largest < this.top / 3) this.top = niceCeiling(Math.max(1.1 * largest, 0.01));
-    for (let i = 0; i < out.length; i += 1) out[i] /= this.top;
+    if (most > this.top || most < this.top / 3) this.top = niceCeiling(Math.max(1.1 * most, 0.01));
+    // values that are negative, such as elongations, are shown on a scale with zero in its middle
+    this.signed = values !== null && (this.signed || -smallest > NEGATIVE * most);
+    const [share, zero] = this.signed ? [0.5 / this.top, 0.5] : [1 / this.top, 0];
+    for (let i = 0; i < out.length; i += 1) out[i] = zero + out[i] * share;
     this.level.needsUpdate = true;
   }
 
@@ -250,11 +256,6 @@ export class LiveView extends View {
     if (this.skin.geometry.index !== index) this.skin.geometry.setIndex(index);
     // what is behind cannot be seen, and takes time; single triangles of a coarse surface may face the other way
     this.skin.material.side = this.scene.closed && !this.clip && !coarse ? FrontSide : DoubleSide;
-  }
-
-  /** Value of the colours at a node: mm of displacement, or what the frame carries. */
-  valueAt(node) {
-    return this.level.array[node] * this.top;
   }
 
   #placeMarkers() {

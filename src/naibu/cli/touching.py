@@ -138,7 +138,7 @@ def cut(
         Replace results that the folder holds.
     """
     from naibu.workflows.interactive.cut import cut as run
-    from naibu.workflows.interactive.cut_surface import is_surface
+    from naibu.workflows.interactive.cut_surface import is_surface, length_text
 
     solid = {
         "pull_percent": pull_percent, "lips_friction": lips_friction, "experiment": experiment, "young_modulus_kpa": young_modulus_kpa,
@@ -161,12 +161,12 @@ def cut(
         )  # fmt: skip
     wrote(*done.files)
     sizes = ", ".join(f"{volume:.4g}" for volume in done.volumes_mm3[:6])
-    say(f"{done.cut.n_pieces} piece(s) of {sizes} mm3; the cut deviates from the blade by {done.cut.deviation_mm:.2g} mm at most.")
+    say(f"{done.cut.n_pieces} piece(s) of {sizes} mm3; the cut deviates from the blade by {length_text(done.cut.deviation_mm)} at most.")
     say(f"Page: {done.files[0]}   {', '.join(str(file) for file in done.files[1:])}")
 
 
 def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, overwrite: bool, options: dict[str, Any]) -> None:
-    from naibu.workflows.interactive.cut_surface import areas_text
+    from naibu.workflows.interactive.cut_surface import areas_text, length_text
     from naibu.workflows.interactive.cut_surface import cut_surface_file as run
 
     stated = {name: value for name, value in options.items() if value is not None}
@@ -174,8 +174,8 @@ def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, 
         done = run(source, path, out=out, distance_mm=distance_mm, overwrite=overwrite, progress=progress, **stated)
     wrote(*done.files)
     say(
-        f"{done.cut.n_pieces} piece(s) of {areas_text(done.cut)} mm2; the cut deviates from the path by {done.cut.deviation_mm:.2g} mm at "
-        f"most, {done.cut.mean_deviation_mm:.2g} mm on average."
+        f"{done.cut.n_pieces} piece(s) of {areas_text(done.cut)} mm2; the cut deviates from the path by "
+        f"{length_text(done.cut.deviation_mm)} at most, {length_text(done.cut.mean_deviation_mm)} on average."
     )
     for repair in done.cut.repairs:
         say(f"Before the cut: {repair}.")

@@ -33,7 +33,6 @@ from naibu.meshing.surface import boundary_faces, triangles_of_faces
 from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
-
 AnySession = Session[Any, Any]
 
 
@@ -429,6 +428,8 @@ class Frame:
         Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
     under_way : bool
         Whether a step takes longer than a frame: all is as before it but the number, and `unbalanced`, which is how far it has come.
+    held : bool
+        Whether crushed cells held the tool back; see `naibu.simulation.held_tool`.
     """
 
     body: InteractiveBody
@@ -446,3 +447,4 @@ class Frame:
     topology: int = 0
     unbalanced: float = 0.0
     under_way: bool = False
+    held: bool = False

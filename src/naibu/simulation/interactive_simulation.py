@@ -23,9 +23,10 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.simulation.background_cut import BackgroundCut
+from naibu.simulation.held_tool import HeldTool, outside_planes
 from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, Frame, InteractiveBody
 from naibu.simulation.lattice_cut import LatticeCut
-from naibu.simulation.tool_places import placed, towards
+from naibu.simulation.tool_places import farthest_in_a_step, placed, towards, waiting_place
 
 FRAME_S = 1.0 / 60.0
 REACH = 2.0  # extents of the body around its centre in which the tool stays
@@ -34,7 +35,6 @@ TURNING = 3.0  # rad/s that the tool turns at most
 LEAST_TURN = 1e-6  # rad
 UNDO = 20  # states kept
 LEAVING_S = 3.0  # simulated time in which a tool that is put away leaves the body at the latest
-THROUGH = 0.5  # of the thinnest half extent of a tool: how far it moves in a step at most, so that nothing passes through its middle
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,6 +82,7 @@ class InteractiveSimulation:
     _last: Frame = field(init=False)
     _topology: int = field(init=False, default=0)
     _surface: IntArray = field(init=False)
+    _held: HeldTool = field(init=False)
     _cutting: BackgroundCut | None = field(init=False, default=None)
     _next: str | None = field(init=False, default=None)  # tool that is taken when the one in play has left the body
     _leaving: int = field(init=False, default=0)  # frames in which it was led away
@@ -331,10 +332,12 @@ class InteractiveSimulation:
             self._under_way, left = (centre, spin, gripped), self.body.unbalanced(self._session)
             self._last = replace(self._last, number=self._last.number + 1, failed="", unbalanced=left, under_way=True)
             return self._last
+        way = centre - self._centre
         self._centre, self._rotation = centre, rotation_matrix(duration * spin) @ self._rotation
         force = forces.indenters[:, -1].mean(axis=0) if self._tool else np.zeros(3)
         pull = forces.bodies[:, 1].mean(axis=0) if self._gripped >= 0 else np.zeros(3)
         self._last = self._frame(self._last.number + 1, self._last.time_s + duration, force, pull, "")
+        self._held.observe(self._last.positions, centre, way, force)
         return self._last
 
     def _presses(self) -> bool:
@@ -363,9 +366,15 @@ class InteractiveSimulation:
 
     def _next_motion(self, duration: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where the tool goes in a frame, mm, how fast it turns, rad/s, and how far gripped nodes go, mm."""
-        reach, held = self.fastest_mm_s * duration, self._grip_position()
-        centre = towards(self._centre, self._target, min(reach, self._thin() * self.steps))
-        return centre, self._spin(duration), towards(held, self._pull_target, reach) - held
+        reach, gripped, centre, spin = self.fastest_mm_s * duration, self._grip_position(), self._target, np.zeros(3)
+        if self._tool:
+            tool, spin = self.tools[self._tool], self._spin(duration) * (not self._held.crushed)
+            turned = placed(tool, centre, rotation_matrix(duration * spin) @ self._rotation)
+            centre = towards(
+                self._centre, outside_planes(self.body.fixtures, turned, centre), min(reach, farthest_in_a_step(tool) * self.steps)
+            )
+            centre = self._centre + self._held.limited(self._centre, centre - self._centre, self._last.force)
+        return centre, spin, towards(gripped, self._pull_target, reach) - gripped
 
     def close(self) -> None:
         """Release what the session holds, and wait for a cut under way."""
@@ -379,6 +388,7 @@ class InteractiveSimulation:
             self._session.close()
         self.body, self._surface = body, np.unique(body.faces)
         self._nodes, self._gripped = NO_NODES, -1
+        self._held = HeldTool.by(body, self.frame_s, FRAME_S)
         self._session = body.session()
         if state is not None:
             self._session.press(())
@@ -402,24 +412,10 @@ class InteractiveSimulation:
         self._tool, self._under_way, self._next, self._leaving, self._trapped = tool, None, None, 0, ""
         self._rotation = self._rotation_target = np.eye(3)
         if tool:
-            self._centre = self._target = self._outside(self.tools[tool])
+            positions = self._session.positions(self._surface)
+            self._centre = self._target = waiting_place(self.tools[tool], positions, 0.1 * self.extent_mm)
         own = [] if not tool else [placed(self.tools[tool], self._centre)]
         self._session.press((*self.body.fixtures, *own))
-
-    def _outside(self, tool: RigidIndenter) -> FloatArray:
-        """Where a tool waits, mm; raised until it is clear of the deformed body."""
-        centre = np.array(tool.centre, dtype=float)
-        positions = self._session.positions(self._surface)
-        for _ in range(40):
-            if placed(tool, centre).gap(positions).min() > 0.0:
-                break
-            centre[2] += 0.1 * self.extent_mm
-        return centre
-
-    def _thin(self) -> float:
-        """How far the tool may move in a step, mm."""
-        size = np.asarray(self.tools[self._tool].geometry.size) if self._tool else np.zeros(0)
-        return THROUGH * float(size[size > 0.0].min(initial=np.inf))
 
     def _grip_position(self) -> FloatArray:
         return self._pull_target if self._gripped < 0 else self._session.positions([self._gripped])[0]
@@ -444,5 +440,5 @@ class InteractiveSimulation:
             depth = max(0.0, -float(placed(self.tools[self._tool], self._centre, self._rotation).gap(positions[self._surface]).min()))
         return Frame(
             self.body, number, time_s, positions, self._tool, self._centre, self._rotation, force, pull, depth, self._gripped, failed,
-            self._topology, self.body.unbalanced(self._session),
+            self._topology, self.body.unbalanced(self._session), held=self._held.held,
         )  # fmt: skip

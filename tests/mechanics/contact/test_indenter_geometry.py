@@ -59,6 +59,19 @@ def test_derivatives_are_those_of_the_distance(name: str) -> None:
     assert (gap < 0.0).any() and (gap > 0.0).any()
 
 
+@pytest.mark.parametrize("name", [name for name in SHAPES if name != "plane" and not name.startswith("bar")])
+def test_a_shape_reaches_as_far_as_the_farthest_of_its_points(name: str) -> None:
+    shape, spacing = SHAPES[name], 0.1
+    grid = np.stack(np.meshgrid(*[np.arange(-5.0, 5.0, spacing)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    inside = grid[shape.distance(grid) <= 0.0]
+    for direction in np.vstack([np.eye(3), -np.eye(3), np.random.default_rng(4).normal(size=(10, 3))]):
+        unit = direction / np.linalg.norm(direction)
+        farthest = float((inside @ unit).max())
+        assert farthest <= shape.reach(unit) + 1e-9
+        assert shape.reach(unit) < farthest + 2.0 * spacing
+    assert SHAPES["plane"].reach(np.array([0.0, 0.0, 1.0])) == np.inf
+
+
 def test_a_mesh_of_a_box_is_the_box() -> None:
     rng = np.random.default_rng(2)
     points = rng.uniform(-6.0, 6.0, (500, 3))

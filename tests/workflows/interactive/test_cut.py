@@ -60,6 +60,10 @@ def test_friction_does_not_hold_what_opens_and_is_refused_where_there_is_none(tm
     rubbed = cut(body, path, out=tmp_path / "rubbed", pull_percent=10.0, lips_friction=0.5)
     assert rubbed.opening_mm == pytest.approx(free.opening_mm, rel=0.02)  # live bodies end their steps sooner than Newton's method
     assert json.loads((tmp_path / "rubbed" / "cut.json").read_text())["lips_friction"] == 0.5
+    page = (tmp_path / "rubbed" / "cut.html").read_text()
+    assert "rub on each other with a friction coefficient of 0.5" in page
+    assert "rub on each other" not in (tmp_path / "free" / "cut.html").read_text()
+    assert "e-1" not in page[page.index("Largest distance from the blade") :][:200]  # rounding errors are no distance
     for wrong in (-0.1, np.nan, np.inf):
         with pytest.raises(InputError, match="lips_friction must be a finite number"):
             cut(body, path, out=tmp_path / "wrong", lips_friction=wrong)
@@ -128,7 +132,7 @@ def test_a_lattice_is_not_cut_nearer_to_the_blade_than_its_cubes_let_it(tmp_path
 def test_paths_that_cannot_be_used_are_refused(tmp_path: Path, text: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         cut(mesh_file(tmp_path), path_file(tmp_path, 0.0, text), out=tmp_path / "out")
-    assert list((tmp_path / "out").glob("*")) == []
+    assert not (tmp_path / "out").exists()  # no empty folder is left
 
 
 def test_what_cannot_be_cut_is_refused(tmp_path: Path) -> None:

@@ -119,6 +119,128 @@ def test_keys_wheel_and_gamepad_move_and_turn_the_tool(tmp_path: Path) -> None:
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
 
 
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_key_that_is_held_leads_the_tool_until_the_body_holds_it_back(tmp_path: Path) -> None:
+    with served() as (address, _), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value("naibuLive.view.look('front'); document.querySelector('.stage').focus()")
+        before = page.value("naibuLive.frame.centre")
+        page.key("s")  # a tap is one step
+        page.wait(f"naibuLive.frame.centre[2] < {before[2]} - 0.5", 30)
+        page.key_event("keyDown", "s")  # held, without repetitions
+        page.wait("naibuLive.badge.textContent.includes('the body is crushed before the tool, which is held back')", 60)
+        time.sleep(1.0)
+        assert page.value("naibuLive.frame.force[2]") < -100.0
+        assert page.value("naibuLive.frame.centre[2]") > 10.0
+        page.picture(tmp_path / "held.png")
+        page.key_event("keyUp", "s")
+        page.key_event("keyDown", "w")  # back at once, however long the other key was held
+        page.wait("naibuLive.frame.force.every((f) => f === 0) && !naibuLive.frame.held", 10)
+        page.key_event("keyUp", "w")
+        still = "new Promise((done) => setTimeout(() => done(naibuLive.frame.centre[2]), 1000))"
+        page.value(still)
+        assert page.value(still) == page.value(still)
+        assert page.console == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_recording_is_saved_as_a_page_that_plays_from_its_file_and_without_one_the_live_page_stays(tmp_path: Path) -> None:
+    save = "[...document.querySelectorAll('button')].find((b) => b.textContent === 'Save as a page').click()"
+    with served() as (address, simulation), opened_browser() as page:
+        page.open(address)
+        page.call("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(tmp_path))
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value(save)
+        page.wait("naibuLive.message.textContent.startsWith('nothing is recorded; press Record')", 30)
+        assert page.value("location.pathname") == "/"
+        page.value("naibuLive.command('record', {on: true}); naibuLive.command('move', {at: [20, 20, 43]})")
+        page.wait("naibuLive.frame.recording && naibuLive.frame.force[2] < -100", 60)
+        time.sleep(1.0)
+        page.value(f"naibuLive.command('record', {{on: false}}); {save}")
+        for _ in range(200):
+            if (tmp_path / "naibu-recording.html").is_file():
+                break
+            time.sleep(0.05)
+        assert page.value("naibuLive.message.textContent") == ""
+        assert [error for error in page.console if "409" not in error] == []  # the browser notes the refusal
+        page.console.clear()
+        page.open((tmp_path / "naibu-recording.html").as_uri())
+        page.wait("document.querySelector('.stage canvas') !== null", 60)
+        assert "sphere" in page.value("document.body.textContent")
+        before = page.value("document.querySelector('input[type=range]').value")
+        page.value("[...document.querySelectorAll('button')].find((b) => b.textContent.includes('Play')).click()")
+        page.wait(f"document.querySelector('input[type=range]').value !== '{before}'", 30)
+        assert page.console == []
+        assert simulation.loop.recorded()
+
+
+PROJECTED = (
+    "(() => { const b = naibuLive.view.canvas.getBoundingClientRect();"
+    " const p = naibuLive.view.camera.position.clone().set(...naibuLive.frame.centre).project(naibuLive.view.camera);"
+    " return [b.left + (p.x + 1) / 2 * b.width, b.top + (1 - p.y) / 2 * b.height]; })()"
+)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_on_a_phone_one_finger_pushes_and_two_look_closer(tmp_path: Path) -> None:
+    with served() as (address, _), opened_browser(390, 844) as page:
+        page.resize(390, 844, scale=3.0)
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        assert page.value("document.documentElement.scrollWidth") <= 390
+        assert "keys" not in page.value("naibuLive.hint.textContent")
+        x, y = page.value(PROJECTED)
+        page.touch("touchStart", (x, y))
+        for k in range(1, 9):
+            page.touch("touchMove", (x, y + 4 * k))
+        page.wait("naibuLive.frame.force[2] < -100 && parseFloat(naibuLive.readout.textContent) > 0.1", 30)
+        seen = page.value("(() => { const b = naibuLive.readout.getBoundingClientRect(); return [b.width, b.top, b.bottom]; })()")
+        assert seen[0] > 20 and 0 < seen[1] < seen[2] < 844  # the force is seen beside the finger
+        page.picture(tmp_path / "phone.png")
+        page.touch("touchEnd")
+        left, top = page.value("(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); return [b.left, b.top]; })()")
+        zoom = page.value("naibuLive.view.camera.zoom")
+        page.touch("touchStart", (left + 20, top + 20), (left + 60, top + 20))
+        for k in range(1, 7):
+            page.touch("touchMove", (left + 20, top + 20), (left + 60 + 8 * k, top + 20))
+        page.touch("touchEnd")
+        page.wait(f"naibuLive.view.camera.zoom > 1.3 * {zoom}", 10)
+        assert page.value("scrollY") == 0
+        page.value("[...document.querySelectorAll('button')].find((b) => b.textContent === 'Whole view').click()")
+        assert page.value("naibuLive.view.camera.zoom") == 1
+        assert page.console == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_point_is_probed_until_the_body_is_another_and_shortened_elements_are_told_from_lengthened_ones(tmp_path: Path) -> None:
+    with served() as (address, _), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value("naibuLive.command('move', {at: [20, 20, 36]}); naibuLive.command('colour', {name: 'strain'}, true)")
+        page.wait("naibuLive.frame.values !== null && Math.min(...naibuLive.frame.values) < -2", 30)
+        page.wait("naibuLive.ticks.textContent.startsWith('−') && naibuLive.ticks.children[2].textContent === '0'", 30)
+        values, level, top = page.value("[[...naibuLive.frame.values], [...naibuLive.view.level.array], naibuLive.view.top]")
+        np.testing.assert_allclose((2.0 * np.array(level) - 1.0) * top, values, atol=0.02 * top)
+        assert top >= np.abs(values).max()
+        page.picture(tmp_path / "signed.png")
+        page.value("naibuLive.command('colour', {name: 'displacement'}, true)")
+        page.wait("naibuLive.ticks.firstChild.textContent === '0'", 30)
+        page.value("naibuLive.take(''); naibuLive.setMode('probe')")
+        page.wait("naibuLive.frame.tool < 0", 30)
+        at = page.value(
+            "(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); const c = [b.left + b.width / 2, b.top + b.height / 2];"
+            " return naibuLive.view.pick(...c) ? c : null; })()"
+        )
+        page.mouse("mousePressed", *at)
+        page.mouse("mouseReleased", *at)
+        page.wait("naibuLive.numbers.probe.textContent.startsWith('moved (')", 30)
+        page.value("naibuLive.command('cut', {edges: [-50, 50].map((y) => [[-50, y, 21], [90, y, 21]])})")
+        page.wait("naibuLive.scene.topology === 1 && naibuLive.frame.topology === 1", 60)
+        page.wait("naibuLive.numbers.probe.textContent === '–'", 30)  # its nodes are others
+        assert page.console == []
+
+
 def pieces(simulation: LiveSimulation) -> int:
     scene = simulation.scene
     ends = np.concatenate([scene.cells[:, 0]] * 3), scene.cells[:, 1:].T.ravel()

@@ -12,7 +12,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import new_aside, writer_of
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import folder_of_results, output_folder
 
 
 def test_a_folder_is_made_and_may_hold_other_files(tmp_path: Path) -> None:
@@ -68,3 +68,24 @@ def test_what_a_killed_run_left_is_removed_and_nothing_else(tmp_path: Path) -> N
 
 def test_long_names_have_temporary_files_too(tmp_path: Path) -> None:
     assert new_aside(tmp_path / ("é" * 115)).exists()
+
+
+def test_a_folder_in_which_a_run_that_failed_wrote_nothing_is_taken_away_again(tmp_path: Path) -> None:
+    def fail(place: Path, name: str = "") -> None:
+        with pytest.raises(InputError, match="useless"), folder_of_results(place, ["report.html"]) as folder:
+            assert folder.is_dir()
+            if name:
+                (folder / name).write_text("")
+            raise InputError("useless")
+
+    fail(tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()
+    fail(tmp_path / "c" / "d", "log.txt")  # what was written is kept
+    assert (tmp_path / "c" / "d" / "log.txt").is_file()
+    (tmp_path / "mine").mkdir()
+    fail(tmp_path / "mine")  # as is a folder that was there before
+    assert (tmp_path / "mine").is_dir()
+    (tmp_path / "c" / "d" / "report.html").write_text("")
+    with pytest.raises(InputError, match="already holds"), folder_of_results(tmp_path / "c" / "d", ["report.html"]):
+        pass
+    assert (tmp_path / "c" / "d" / "report.html").is_file()

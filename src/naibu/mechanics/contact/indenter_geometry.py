@@ -103,6 +103,23 @@ class IndenterGeometry:
             return r * (length + 4.0 / 3.0 * r) / (2.0 * length + 4.0 * r)
         return {SPHERE: r / 3.0, BAR: 0.5 * r}.get(self.kind, self.inradius)
 
+    def reach(self, direction: ArrayLike) -> float:
+        """Return how far the shape extends from its reference point along a unit vector (3,), mm; infinite for planes and bars.
+
+        It is the support function of the shape.
+        """
+        along = self.axes @ np.asarray(direction, dtype=float)
+        if self.tree is not None:
+            return float((self.vertices @ along).max())
+        if self.kind == BOX:
+            return float(self.size @ np.abs(along))
+        if self.kind in (PLANE, BAR):
+            return np.inf
+        radius, half = float(self.size[0]), float(self.size[1])
+        if self.kind == CYLINDER:
+            return half * abs(float(along[2])) + radius * float(np.hypot(along[0], along[1]))
+        return radius + half * abs(float(along[2]))
+
     def distance(self, points: ArrayLike) -> FloatArray:
         """Return the signed distances (p,), mm, of points (p, 3) in the indenter's frame; positive outside."""
         return self.distance_derivatives(points)[0]

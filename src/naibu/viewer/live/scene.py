@@ -36,7 +36,7 @@ HEADER = np.dtype(
         ("readings", "<u4"),
     ]
 )
-PAUSED, DRIVING, RECORDING, REPLAYING, FAILED = 1, 2, 4, 8, 16
+PAUSED, DRIVING, RECORDING, REPLAYING, FAILED, HELD = 1, 2, 4, 8, 16, 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +162,7 @@ class LiveFrame:
     penetration_mm, steps_per_s, real_time : float
         How deep the surface lies in the tool; steps a second; simulated seconds a second.
     flags : int
-        Sum of `PAUSED`, `RECORDING`, `REPLAYING`, `FAILED`.
+        Sum of `PAUSED`, `RECORDING`, `REPLAYING`, `FAILED`, `HELD` (the tool is held back).
     strain : callable
         Returns the strain at the nodes (n,), computed when it is asked for.
     topology : int

@@ -33,9 +33,10 @@ from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, motion_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Table, quantity_of
+from naibu.workflows.interactive.cut_surface import length_text
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, touchable
 from naibu.workflows.markers.experiments import Source
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import folder_of_results
 
 FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
 FRAME_S = 1.0 / 60.0
@@ -125,35 +126,35 @@ def cut(
         raise InputError(f"lips_friction must be a finite number that is not negative, not {lips_friction:g}; 0 is frictionless")
     require_lengths(distance_mm=distance_mm)
     blade = _blade(path)
-    folder = output_folder(out, FILES, overwrite=overwrite)
-    model = touchable(source, experiment=experiment, material=material)
-    if lips_friction > 0.0 and isinstance(model.body, LatticeBody):
-        raise InputError(f"lips_friction must be 0, not {lips_friction:g}: the sides of the cut of a lattice do not touch each other")
-    before, after, found, distance = _cut(model.body, blade, distance_mm)
-    if not len(found.faces):
-        raise InputError(
-            f"{path}: the blade passes beside the body, which reaches {_reach(before.points)}, or only grazes it; check the path and its "
-            "unit (mm)"
-        )
-    a, b, c = after.points[found.faces].transpose(1, 0, 2)
-    areas = 0.5 * np.cross(b - a, c - a)
-    axis = int(np.abs(areas).sum(axis=0).argmax())
-    turn = after.engine.lattice.frame.rotation if isinstance(after, LatticeBody) else np.eye(3)
-    times, moved = _pulled(_rubbing(after, lips_friction), axis, pull_percent, progress)
-    moved = moved @ turn.T
-    volumes = np.bincount(found.piece, signed_volumes(found.mesh)).astype(np.float64)
-    opening = _opening(found, moved[-1])
-    numbers = _numbers(before, found, volumes) | {
-        "area_of_the_cut_mm2": 0.5 * float(np.linalg.norm(areas, axis=1).sum()),
-        "area_of_the_blade_path_mm2": blade.area_mm2, "largest_distance_from_the_blade_mm": found.deviation_mm,
-        **({} if distance is None else {"allowed_distance_mm": 0.5 * distance}), "largest_opening_mm": opening,
-        "source": str(source), "naibu": __version__, "pull_percent": pull_percent,
-        **({"lips_friction": lips_friction} if lips_friction else {}),
-        **({"doubt": model.doubt} if model.doubt else {}),
-        "pulled_along": "xyz"[int(np.abs(turn[:, axis]).argmax())], "inputs_sha256": {Path(path).name: sha256(path)},
-    }  # fmt: skip
-    files = _written(folder, model, after.faces, found, numbers, times, moved)
-    return CutRun(files, found, volumes, opening)
+    with folder_of_results(out, FILES, overwrite=overwrite) as folder:
+        model = touchable(source, experiment=experiment, material=material)
+        if lips_friction > 0.0 and isinstance(model.body, LatticeBody):
+            raise InputError(f"lips_friction must be 0, not {lips_friction:g}: the sides of the cut of a lattice do not touch each other")
+        before, after, found, distance = _cut(model.body, blade, distance_mm)
+        if not len(found.faces):
+            raise InputError(
+                f"{path}: the blade passes beside the body, which reaches {_reach(before.points)}, or only grazes it; check the path and "
+                "its unit (mm)"
+            )
+        a, b, c = after.points[found.faces].transpose(1, 0, 2)
+        areas = 0.5 * np.cross(b - a, c - a)
+        axis = int(np.abs(areas).sum(axis=0).argmax())
+        turn = after.engine.lattice.frame.rotation if isinstance(after, LatticeBody) else np.eye(3)
+        times, moved = _pulled(_rubbing(after, lips_friction), axis, pull_percent, progress)
+        moved = moved @ turn.T
+        volumes = np.bincount(found.piece, signed_volumes(found.mesh)).astype(np.float64)
+        opening = _opening(found, moved[-1])
+        numbers = _numbers(before, found, volumes) | {
+            "area_of_the_cut_mm2": 0.5 * float(np.linalg.norm(areas, axis=1).sum()),
+            "area_of_the_blade_path_mm2": blade.area_mm2, "largest_distance_from_the_blade_mm": found.deviation_mm,
+            **({} if distance is None else {"allowed_distance_mm": 0.5 * distance}), "largest_opening_mm": opening,
+            "source": str(source), "naibu": __version__, "pull_percent": pull_percent,
+            **({"lips_friction": lips_friction} if lips_friction else {}),
+            **({"doubt": model.doubt} if model.doubt else {}),
+            "pulled_along": "xyz"[int(np.abs(turn[:, axis]).argmax())], "inputs_sha256": {Path(path).name: sha256(path)},
+        }  # fmt: skip
+        files = _written(folder, model, after.faces, found, numbers, times, moved)
+        return CutRun(files, found, volumes, opening)
 
 
 def _blade(path: str | os.PathLike[str]) -> SweptBlade:
@@ -270,7 +271,7 @@ def _cards(numbers: Mapping[str, Any]) -> tuple[Card, ...]:
     return (
         Card("Pieces", str(numbers["pieces"]), f"{', '.join(volumes[:4])}{', ...' if len(volumes) > 4 else ''} cm³"),
         Card("Area of the cut", f"{1e-2 * numbers['area_of_the_cut_mm2']:.3g} cm²"),
-        Card("Largest distance from the blade", f"{numbers['largest_distance_from_the_blade_mm']:.2g} mm"),
+        Card("Largest distance from the blade", length_text(numbers["largest_distance_from_the_blade_mm"])),
         Card("Largest opening", f"{numbers['largest_opening_mm']:.3g} mm", f"ends pulled apart by {numbers['pull_percent']:g} %"),
     )
 
@@ -280,11 +281,13 @@ def _page(
 ) -> MotionPage:
     nodes, faces = np.unique(shown, return_inverse=True)
     sizes = ", ".join(f"{1e-3 * v:.4g}" for v in numbers["volumes_mm3"][:6])
+    friction = numbers.get("lips_friction")
     said = (
         f"The cut leaves {found.n_pieces} {'piece' if found.n_pieces == 1 else 'pieces'} of {sizes} cm³. It deviates from the blade by "
-        f"{found.deviation_mm:.2g} mm at most and opens by {numbers['largest_opening_mm']:.3g} mm where its ends along "
+        f"{length_text(found.deviation_mm)} at most and opens by {numbers['largest_opening_mm']:.3g} mm where its ends along "
         f"{numbers['pulled_along']} are pulled apart by {numbers['pull_percent']:g} %.",
         model.sentences[0],
+        *([f"Its sides rub on each other with a friction coefficient of {friction:g}."] if friction else []),
         *([model.doubt] if model.doubt else []),
     )
     rows = [(quantity_of(name), value) for name, value in numbers.items() if isinstance(value, int | float)]

@@ -29,7 +29,7 @@ from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Table, quantity_of
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import folder_of_results
 
 FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
 FRAMES, LARGE_FRAMES = 24, 8
@@ -125,30 +125,36 @@ def cut_surface_file(
     require_within("tension_percent", tension_percent, 0.0, 100.0 * LARGEST_TENSION)
     require_lengths(distance_mm=distance_mm, groove_depth_mm=groove_depth_mm or None, reach_mm=reach_mm)
     surface, tips = read_surface(source, unit_mm=unit_mm), read_tip_path(path)
-    folder = output_folder(out, FILES, overwrite=overwrite)
-    distance = 0.5 * mean_edge_mm(surface) if distance_mm is None else distance_mm
-    try:
-        found = cut_along(surface.points, surface.triangles, tips, distance, reach_mm=reach_mm, refined=refine)
-    except InputError as error:
-        raise InputError(f"{path}: {error}" if "the tip stays" in str(error) else str(error)) from error
-    if not len(found.cut_edges):
-        raise InputError(
-            f"{path}: is too short to cut anything at a distance of {distance:.3g} mm; give a longer path or a smaller distance_mm"
-        )
-    points, walls, wall_area = _grooved(found, groove_depth_mm, distance)
-    frames = 1 if not tension_percent else FRAMES if len(found.points) <= LARGE_POINTS else LARGE_FRAMES
-    moved = np.zeros((frames + 1, len(points), 3))
-    for k, displacement in enumerate(opening(found, 0.01 * tension_percent, frames=frames)):
-        moved[k, : len(found.points)] = displacement
-        report_progress(progress, "open the cut", done=k + 1, total=frames + 1)
-    copies = np.flatnonzero(found.source != np.arange(len(found.points)))
-    gaps = np.linalg.norm(moved[-1, copies] - moved[-1, found.roots[copies]], axis=1)
-    numbers = _numbers(surface, found, distance, wall_area, float(gaps.max(initial=0.0))) | {
-        "tension_percent": tension_percent, "refined": refine, "repairs": list(found.repairs), "source": str(source), "naibu": __version__,
-        "inputs_sha256": {Path(name).name: sha256(name) for name in (source, path)},
-    }  # fmt: skip
-    files = _written(folder, found, points, walls, numbers, moved)
-    return SurfaceCutRun(files, found, numbers, moved[:, : len(found.points)])
+    with folder_of_results(out, FILES, overwrite=overwrite) as folder:
+        distance = 0.5 * mean_edge_mm(surface) if distance_mm is None else distance_mm
+        try:
+            found = cut_along(surface.points, surface.triangles, tips, distance, reach_mm=reach_mm, refined=refine)
+        except InputError as error:
+            raise InputError(f"{path}: {error}" if "the tip stays" in str(error) else str(error)) from error
+        if not len(found.cut_edges):
+            raise InputError(
+                f"{path}: is too short to cut anything at a distance of {distance:.3g} mm; give a longer path or a smaller distance_mm"
+            )
+        points, walls, wall_area = _grooved(found, groove_depth_mm, distance)
+        frames = 1 if not tension_percent else FRAMES if len(found.points) <= LARGE_POINTS else LARGE_FRAMES
+        moved = np.zeros((frames + 1, len(points), 3))
+        for k, displacement in enumerate(opening(found, 0.01 * tension_percent, frames=frames)):
+            moved[k, : len(found.points)] = displacement
+            report_progress(progress, "open the cut", done=k + 1, total=frames + 1)
+        copies = np.flatnonzero(found.source != np.arange(len(found.points)))
+        gaps = np.linalg.norm(moved[-1, copies] - moved[-1, found.roots[copies]], axis=1)
+        numbers = _numbers(surface, found, distance, wall_area, float(gaps.max(initial=0.0))) | {
+            "tension_percent": tension_percent, "refined": refine, "repairs": list(found.repairs), "source": str(source),
+            "naibu": __version__,
+            "inputs_sha256": {Path(name).name: sha256(name) for name in (source, path)},
+        }  # fmt: skip
+        files = _written(folder, found, points, walls, numbers, moved)
+        return SurfaceCutRun(files, found, numbers, moved[:, : len(found.points)])
+
+
+def length_text(length_mm: float) -> str:
+    """Return a length as text, mm; rounding errors are no length."""
+    return f"{round(length_mm, 6):.2g} mm"
 
 
 def areas_text(found: SurfaceCut) -> str:
@@ -233,7 +239,7 @@ def _cards(found: SurfaceCut, numbers: Mapping[str, Any]) -> tuple[Card, ...]:
     return (
         Card("Pieces", str(found.n_pieces), f"{areas_text(found)} mm²"),
         Card("Length of the cut", f"{found.length_mm:.3g} mm"),
-        Card("Largest distance from the path", f"{found.deviation_mm:.2g} mm", f"{numbers['allowed_distance_mm']:.2g} mm are allowed"),
+        Card("Largest distance from the path", length_text(found.deviation_mm), f"{numbers['allowed_distance_mm']:.2g} mm are allowed"),
         Card("Largest opening", f"{numbers['largest_opening_mm']:.3g} mm", f"under a tension of {numbers['tension_percent']:g} %"),
     )
 
@@ -244,7 +250,7 @@ def _page(
     sizes = areas_text(found)
     said = [
         f"The cut leaves {found.n_pieces} {'piece' if found.n_pieces == 1 else 'pieces'} of {sizes} mm². It deviates from the path of the "
-        f"tool by {found.deviation_mm:.2g} mm at most, {found.mean_deviation_mm:.2g} mm on average, where "
+        f"tool by {length_text(found.deviation_mm)} at most, {length_text(found.mean_deviation_mm)} on average, where "
         f"{numbers['allowed_distance_mm']:.2g} mm are allowed{'' if numbers['refined'] else ' with refinement'}.",
         f"Under a tension of {numbers['tension_percent']:g} % it opens by {numbers['largest_opening_mm']:.3g} mm. The points of this "
         "mass-spring model slide on what is beneath; those farther from the cut than it is long, and the rim, stay.",

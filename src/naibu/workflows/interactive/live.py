@@ -24,7 +24,7 @@ from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.simulation.tool_places import placed
 from naibu.viewer.live.commands import LiveCommand
-from naibu.viewer.live.scene import FAILED, PAUSED, RECORDING, REPLAYING, LiveFrame, LiveScene
+from naibu.viewer.live.scene import FAILED, HELD, PAUSED, RECORDING, REPLAYING, LiveFrame, LiveScene
 from naibu.viewer.live.server import LiveServer, bound_port, serve
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.workflows.applications.fingertip_study import FINGERTIP, describes_fingertip
@@ -78,6 +78,7 @@ class LiveSimulation:
         """Return the last frame."""
         frame, pace = self.loop.latest()
         flags = PAUSED * pace.paused | RECORDING * pace.recording | REPLAYING * pace.replaying | FAILED * bool(frame.failed)
+        flags |= HELD * frame.held
         tool = list(self.loop.simulation.tools).index(frame.tool) if frame.tool else -1
         return LiveFrame(
             frame.number, frame.time_s, frame.positions, tool, frame.gripped, frame.tool_centre, frame.force, frame.pull,

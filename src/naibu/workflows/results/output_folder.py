@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from naibu.core.errors import InputError
@@ -58,3 +59,23 @@ def output_folder(
         )
     remove_orphans(folder, keep)
     return folder
+
+
+@contextmanager
+def folder_of_results(out: str | os.PathLike[str], files: Iterable[str] = (), *, overwrite: bool = False) -> Iterator[Path]:
+    """Make a folder as `output_folder` does, for a run that may find its input useless: it is taken away again if nothing was written.
+
+    Raises
+    ------
+    InputError
+        See `output_folder`.
+    """
+    wanted = require_usable_path(out, written=True)
+    new = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
+    try:
+        yield output_folder(out, files, overwrite=overwrite)
+    except BaseException:
+        with suppress(OSError):  # the first that is not empty, or was not made
+            for folder in new:
+                folder.rmdir()
+        raise
