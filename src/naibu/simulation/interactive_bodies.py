@@ -18,7 +18,6 @@ from naibu.mechanics.contact.session_protocol import Session, StepForces
 from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
-from naibu.mechanics.finite_strain.lip_assembly import with_lips
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine, DynamicState
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeEngine, RealTimeSession
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
@@ -30,6 +29,7 @@ from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.quality import mean_edge_length
 from naibu.meshing.refinement.forest import BisectionForest
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
+from naibu.simulation.cut_sides import with_sides_of_cuts
 from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
@@ -350,7 +350,7 @@ class FiniteElementBody:
         placeholder = [material(young_modulus=1.0, poisson_ratio=0.3)] * len(mesh.region_names)
         made = Assembler.from_materials(elements(found.mesh, "mean_dilatation"), found.mesh.regions, placeholder)
         made = replace(made, law_codes=assembler.law_codes[before], parameters=assembler.parameters[before])
-        made = with_lips(made, found.mesh.points, boundary_faces(found.mesh).faces)
+        made = with_sides_of_cuts(made, found.mesh)
         held = np.zeros(mesh.n_points)
         held[self.supported] = 1.0
         body = FiniteElementBody.of(
