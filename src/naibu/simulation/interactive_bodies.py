@@ -220,6 +220,8 @@ class FiniteElementBody:
         Rigid bodies in contact that never move.
     forest : BisectionForest, optional
         Of the cut that the mesh comes from, for the next one.
+    lips_friction : float
+        Coulomb's coefficient between the sides of the cuts to come.
     """
 
     engine: DynamicEngine
@@ -231,6 +233,7 @@ class FiniteElementBody:
     supported: IntArray
     fixtures: tuple[RigidIndenter, ...]
     forest: BisectionForest | None = None
+    lips_friction: float = 0.0
 
     @classmethod
     def of(
@@ -350,16 +353,15 @@ class FiniteElementBody:
         placeholder = [material(young_modulus=1.0, poisson_ratio=0.3)] * len(mesh.region_names)
         made = Assembler.from_materials(elements(found.mesh, "mean_dilatation"), found.mesh.regions, placeholder)
         made = replace(made, law_codes=assembler.law_codes[before], parameters=assembler.parameters[before])
-        made = with_sides_of_cuts(made, found.mesh)
-        held = np.zeros(mesh.n_points)
-        held[self.supported] = 1.0
+        made = with_sides_of_cuts(made, found.mesh, self.lips_friction)
+        held = np.isin(np.arange(mesh.n_points), self.supported).astype(float)
         body = FiniteElementBody.of(
             found.mesh, made, supported=np.flatnonzero(found.nodal(held) > 1.0 - 1e-9).astype(np.int64), fixtures=self.fixtures,
             density=self.density, gravity=self.gravity, step_s=self.engine.step, normal_stiffness=self.engine.normal_stiffness,
             tangential_stiffness=self.engine.tangential_stiffness,
             background=not isinstance(self.engine, RealTimeEngine) or self.engine.background,
         )  # fmt: skip
-        body = replace(body, forest=found.forest)
+        body = replace(body, forest=found.forest, lips_friction=self.lips_friction)
         return body, DynamicState(found.nodal(state.displacement), found.nodal(state.velocity)), found
 
     def unbalanced(self, session: AnySession) -> float:

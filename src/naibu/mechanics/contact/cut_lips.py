@@ -99,6 +99,10 @@ class CutLips:
         self._rubbed(gap, normal, self._relative(displacement), np.zeros_like(displacement), blocks, traction)
         return _across(gap, self.area, self.edge, self.stiffness), traction
 
+    def rubbing(self, displacement: FloatArray) -> float:
+        """Return the sum of the components of friction on both sides, mN, at a displacement (n, 3), mm."""
+        return 2.0 * float(np.abs(self.slip_forces(displacement)[1]).sum()) if self.friction > 0.0 else 0.0
+
     def with_normals_of(self, displacement: FloatArray) -> CutLips:
         """Return the same pairs with the normals, and the choice of pairs that touch, of a displacement (n, 3), mm.
 
