@@ -175,7 +175,7 @@ def path(n: int, criterion: StressError | None) -> tuple[np.ndarray, list[int], 
 
 
 def dynamics() -> None:
-    criterion = StressError(50.0, 0.3, 0.016, 0.2 * 0.016, least=80.0)
+    criterion = StressError(50.0, 0.3, 0.017, 0.1 * 0.017, least=80.0)
     path(4, criterion)  # compiles
     reference, nodes, time_9 = path(9, None)
     largest = np.abs(reference).max()

@@ -33,6 +33,7 @@ def live(
     port: Whole = 8765,
     haptics_port: Whole | None = None,
     decoder: Path | None = None,
+    lips_friction: float = 0.0,
     browser: bool = True,
 ) -> None:
     """Touch a simulated body in the browser: push it, pull it, look inside and read the force.
@@ -56,6 +57,8 @@ def live(
         UDP port of this computer at which a haptic device leads the tool, such as 8766.
     decoder
         Of your own fingertip: NAME-decoder.json, which naibu simulate writes of it.
+    lips_friction
+        Coefficient of friction between the two sides of a cut, of finite elements.
     browser
         Open the page in the browser.
     """
@@ -74,7 +77,7 @@ def live(
 
     served(
         source, experiment=experiment, material=_material(young_modulus_kpa, poisson_ratio), port=port,
-        haptics_port=haptics_port, decoder=decoder, preparing=preparing, ready=ready,
+        haptics_port=haptics_port, decoder=decoder, lips_friction=lips_friction, preparing=preparing, ready=ready,
     )  # fmt: skip
 
 

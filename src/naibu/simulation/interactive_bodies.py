@@ -18,7 +18,6 @@ from naibu.mechanics.contact.session_protocol import Session, StepForces
 from naibu.mechanics.finite_elements.assembly import Assembler, body_force
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
-from naibu.mechanics.finite_strain.lip_assembly import with_lips
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine, DynamicState
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeEngine, RealTimeSession
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
@@ -30,6 +29,7 @@ from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.quality import mean_edge_length
 from naibu.meshing.refinement.forest import BisectionForest
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
+from naibu.simulation.cut_sides import with_sides_of_cuts
 from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
@@ -219,6 +219,8 @@ class FiniteElementBody:
         Rigid bodies in contact that never move.
     forest : BisectionForest, optional
         Of the cut that the mesh comes from, for the next one.
+    lips_friction : float
+        Coulomb's coefficient between the sides of the cuts to come.
     """
 
     engine: DynamicEngine
@@ -230,6 +232,7 @@ class FiniteElementBody:
     supported: IntArray
     fixtures: tuple[RigidIndenter, ...]
     forest: BisectionForest | None = None
+    lips_friction: float = 0.0
 
     @classmethod
     def of(
@@ -349,16 +352,15 @@ class FiniteElementBody:
         placeholder = [material(young_modulus=1.0, poisson_ratio=0.3)] * len(mesh.region_names)
         made = Assembler.from_materials(elements(found.mesh, "mean_dilatation"), found.mesh.regions, placeholder)
         made = replace(made, law_codes=assembler.law_codes[before], parameters=assembler.parameters[before])
-        made = with_lips(made, found.mesh.points, boundary_faces(found.mesh).faces)
-        held = np.zeros(mesh.n_points)
-        held[self.supported] = 1.0
+        made = with_sides_of_cuts(made, found.mesh, self.lips_friction)
+        held = np.isin(np.arange(mesh.n_points), self.supported).astype(float)
         body = FiniteElementBody.of(
             found.mesh, made, supported=np.flatnonzero(found.nodal(held) > 1.0 - 1e-9).astype(np.int64), fixtures=self.fixtures,
             density=self.density, gravity=self.gravity, step_s=self.engine.step, normal_stiffness=self.engine.normal_stiffness,
             tangential_stiffness=self.engine.tangential_stiffness,
             background=not isinstance(self.engine, RealTimeEngine) or self.engine.background,
         )  # fmt: skip
-        body = replace(body, forest=found.forest)
+        body = replace(body, forest=found.forest, lips_friction=self.lips_friction)
         return body, DynamicState(found.nodal(state.displacement), found.nodal(state.velocity)), found
 
     def unbalanced(self, session: AnySession) -> float:

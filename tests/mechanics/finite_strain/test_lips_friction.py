@@ -165,7 +165,14 @@ def test_a_quasi_static_session_slides_rests_and_slides_back() -> None:
     assert abs(ratio).max() < 1.02 * friction
 
 
-def sliding(slope: float, friction: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
+def stepped_by(kind: type[DynamicEngine], made: Assembler, mesh: Mesh, step: float) -> tuple[DynamicEngine, np.ndarray]:
+    """An engine of a body as dense as water, and its nodal masses, kg."""
+    mass = body_force(made.elements, np.full(mesh.n_cells, 1e-6), np.array([1.0, 0.0, 0.0]))[:, 0]
+    options = {"background": False} if kind is RealTimeEngine else {}
+    return kind(mesh.points, made, mass, boundary_faces(mesh).faces, step=step, tolerance=1e-5, **options), mass
+
+
+def sliding(slope: float, friction: float, steps: int, kind: type[DynamicEngine]) -> tuple[np.ndarray, np.ndarray]:
     """Mean position and velocity (steps, 3) of the piece above an inclined cut, under its weight; what lies below is fixed."""
     mesh = inclined(slope)
     made = problem(mesh, (0.0, 0.0, 0.0), friction).assembler
@@ -173,8 +180,7 @@ def sliding(slope: float, friction: float, steps: int) -> tuple[np.ndarray, np.n
     centre = mesh.points[mesh.cells].mean(axis=1)
     share = 1.0 - np.abs(centre[:, 2] - 0.5 * SIZE) / (0.5 * SIZE)
     upper[mesh.cells[centre[:, 2] > 0.5 * SIZE + share * slope * (centre[:, 1] - 0.5 * SIZE)]] = True
-    mass = body_force(made.elements, np.full(mesh.n_cells, 1e-6), np.array([1.0, 0.0, 0.0]))[:, 0]
-    engine = DynamicEngine(mesh.points, made, mass, boundary_faces(mesh).faces, step=1e-3, tolerance=1e-5)
+    engine, mass = stepped_by(kind, made, mesh, 1e-3)
     weight = mass[:, None] * np.array([0.0, 0.0, -9810.0])
     share_of = (mass * upper / mass[upper].sum())[:, None]
     place, speed = [], []
@@ -186,24 +192,56 @@ def sliding(slope: float, friction: float, steps: int) -> tuple[np.ndarray, np.n
     return np.array(place), np.array(speed)
 
 
-def test_a_piece_slides_down_a_cut_with_the_acceleration_of_a_block_on_a_slope() -> None:
+@pytest.mark.parametrize("kind", [DynamicEngine, RealTimeEngine])
+def test_a_piece_slides_down_a_cut_with_the_acceleration_of_a_block_on_a_slope(kind: type[DynamicEngine]) -> None:
     slope, friction = 0.4, 0.2
-    _, speed = sliding(slope, friction, 40)
+    _, speed = sliding(slope, friction, 40, kind)
     angle = np.arctan(slope)
     along = -speed @ np.array([0.0, np.cos(angle), np.sin(angle)])
     found = np.polyfit(1e-3 * np.arange(15, 40), along[15:], 1)[0]  # once the piece has settled on the slope
     assert found == pytest.approx(9810.0 * (np.sin(angle) - friction * np.cos(angle)), rel=0.02)
 
 
-def test_a_piece_rests_on_a_cut_that_is_less_steep_than_the_angle_of_friction() -> None:
-    place, speed = sliding(0.3, 0.5, 300)
+@pytest.mark.parametrize("kind", [DynamicEngine, RealTimeEngine])
+def test_a_piece_rests_on_a_cut_that_is_less_steep_than_the_angle_of_friction(kind: type[DynamicEngine]) -> None:
+    place, speed = sliding(0.3, 0.5, 300, kind)
     assert np.abs(speed[20]).max() > 1.0  # it sinks in and sways
     assert np.abs(speed[-1]).max() < 0.005
     assert np.linalg.norm(place[-1] - place[-100]) < 1e-4  # and does not creep: at 0.01 mm/s it would have gone 1e-3 mm
 
 
-def test_a_live_body_refuses_what_it_does_not_keep() -> None:
-    mesh = inclined(0.2)
-    made, mass = problem(mesh, (0.0, 0.0, 0.0), 0.2).assembler, np.full(mesh.n_points, 1e-6)
-    with pytest.raises(InputError, match="lips_friction must be 0 in real time"):
-        RealTimeEngine(mesh.points, made, mass, boundary_faces(mesh).faces)
+def rubbed(kind: type[DynamicEngine], friction: float, slope: float, path: list[tuple[float, float]]) -> tuple[np.ndarray, list[float]]:
+    """Forces on the upper face (steps, 3), mN, that moves along x and z at these speeds, mm/s, and the work of friction in each step."""
+    mesh = inclined(slope)
+    made = problem(mesh, (0.0, 0.0, 0.0), friction).assembler
+    engine, _ = stepped_by(kind, made, mesh, 5e-3)
+    low, high = (np.flatnonzero(side) for side in (mesh.points[:, 2] < 1e-9, mesh.points[:, 2] > SIZE - 1e-9))
+    forces, lost = [], []
+    with engine.session(constrained=[low, high]) as session:
+        for along, down in path:
+            before = session.state()
+            forces.append(session.step([[0.0, 0.0, 0.0], [along, 0.0, down]]).bodies[0, 1])
+            after = session.state()
+            stepped = engine.assembler.in_step(before.displacement, before.lips)
+            assert isinstance(stepped, LipAssembler) and stepped.lips is not None
+            anchors = stepped.lips._relative(np.zeros_like(mesh.points)) if before.lips is None else before.lips
+            across, traction = stepped.lips.slip_forces(after.displacement)
+            assert (np.linalg.norm(traction, axis=1) <= friction * across * (1.0 + 1e-9)).all()
+            slip = np.where(across[:, None] > 0.0, after.lips - anchors, 0.0)
+            lost.append(float((traction * slip).sum()))
+    return np.array(forces), lost
+
+
+def test_sides_of_a_cut_rub_in_real_time_as_newtons_method_has_it_and_always_dissipate() -> None:
+    path = [(0.0, -10.0)] * 20 + [(6.0, 0.0)] * 50 + [(0.0, 0.0)] * 10 + [(-6.0, 0.0)] * 100
+    (exact, _), (found, lost) = (rubbed(kind, 0.3, 0.0, path) for kind in (DynamicEngine, RealTimeEngine))
+    np.testing.assert_allclose(found, exact, atol=0.005 * np.abs(exact[:, 0]).max())
+    assert min(lost) > -1e-9 and sum(lost) > 1.0
+    ratio = found[:, 0] / -found[:, 2]
+    assert ratio[60] > 0.25 and ratio[-1] < -0.25 and np.abs(ratio[20:]).max() < 0.3  # the pieces yield at the rim, where less presses
+
+
+def test_in_real_time_the_force_on_a_steep_cut_is_that_of_a_sliding_wedge() -> None:
+    friction, slope = 0.2, 0.4
+    forces, _ = rubbed(RealTimeEngine, friction, slope, [(0.0, -0.5)] * 20)  # slowly, by a quarter of a per cent
+    assert abs(forces[-1, 1]) / -forces[-1, 2] == pytest.approx(np.tan(np.arctan(slope) - np.arctan(friction)), rel=0.01)

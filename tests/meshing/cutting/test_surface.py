@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
 from naibu.core.errors import InputError
 from naibu.meshing import SurfaceCut, SurfaceCutter, boundary_faces, box, cut_surface, groove
@@ -265,3 +266,23 @@ def test_what_cannot_be_cut_is_refused(change, said):
     given = {"points": points, "triangles": triangles, "path": [[10, 10, 0], [50, 50, 0]], "distance_mm": D} | change
     with pytest.raises(InputError, match=said):
         cut_surface(**given)
+
+
+@pytest.mark.parametrize("seed", [0, 4, 5, 8, 14, 15, 21, 28, 34, 45])
+def test_a_cut_across_a_sheet_parts_it_also_through_flat_triangles_on_its_border(seed: int) -> None:
+    """Delaunay's triangles of random points in a square: those on its sides are flatter the nearer a point lies to a side."""
+    rng = np.random.default_rng(seed)
+    flat = np.concatenate([rng.uniform(0.0, 100.0, (150, 2)), [[0.0, 0.0], [100.0, 0.0], [100.0, 100.0], [0.0, 100.0]]])
+    begin, end = np.random.default_rng(1000 + seed).uniform(10.0, 90.0, 2)
+    path = np.array([[-5.0, begin, 0.0], [105.0, end, 0.0]])
+    if seed % 2:
+        path = path[:, [1, 0, 2]]
+    distance = 4.0
+    cut = cut_surface(np.pad(flat, ((0, 0), (0, 1))), Delaunay(flat).simplices, path, distance)
+    corners = cut.points[cut.triangles]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    parts = np.sort(np.bincount(cut.piece, area))[::-1]
+    mean = 0.5 * (begin + end) * 100.0  # on one side of the straight path
+    expected = np.sort([mean, 1e4 - mean])[::-1]
+    np.testing.assert_allclose(parts[:2], expected, atol=0.5 * distance * 110.0)
+    assert parts.sum() == pytest.approx(1e4, rel=1e-12) and cut.deviation_mm <= 0.5 * distance

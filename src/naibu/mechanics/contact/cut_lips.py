@@ -99,6 +99,10 @@ class CutLips:
         self._rubbed(gap, normal, self._relative(displacement), np.zeros_like(displacement), blocks, traction)
         return _across(gap, self.area, self.edge, self.stiffness), traction
 
+    def rubbing(self, displacement: FloatArray) -> float:
+        """Return the sum of the components of friction on both sides, mN, at a displacement (n, 3), mm."""
+        return 2.0 * float(np.abs(self.slip_forces(displacement)[1]).sum()) if self.friction > 0.0 else 0.0
+
     def with_normals_of(self, displacement: FloatArray) -> CutLips:
         """Return the same pairs with the normals, and the choice of pairs that touch, of a displacement (n, 3), mm.
 
@@ -120,17 +124,21 @@ class CutLips:
         """Return the distances (p,), mm, along the normals: negative where the sides overlap, infinite where they face away."""
         return self._gaps_and_normals(displacement)[0]
 
-    def add(self, displacement: FloatArray, force: FloatArray) -> tuple[float, FloatArray]:
-        """Add to internal forces (n, 3), mN; return the energy, mN mm, and the stiffness of every pair (p, 3, 3), mN/mm."""
+    def add(self, displacement: FloatArray, force: FloatArray, *, secant: bool = False) -> tuple[float, FloatArray]:
+        """Add to internal forces (n, 3), mN; return the energy, mN mm, and the stiffness of every pair (p, 3, 3), mN/mm.
+
+        With the `secant` of friction, its force over the elastic slip, instead of the derivative, the stiffness is symmetric and positive.
+        """
         gap, normal = self._gaps_and_normals(displacement)
         blocks = np.zeros((len(self.pairs), 3, 3))
         energy = _pressed(gap, normal, self.pairs, self.area, self.edge, self.stiffness, force, blocks)
         if self.friction > 0.0:
-            energy += self._rubbed(gap, normal, self._relative(displacement), force, blocks, np.zeros_like(normal))
+            energy += self._rubbed(gap, normal, self._relative(displacement), force, blocks, np.zeros_like(normal), secant=secant)
         return float(energy), blocks
 
     def _rubbed(
-        self, gap: FloatArray, normal: FloatArray, relative: FloatArray, force: FloatArray, blocks: FloatArray, traction: FloatArray
+        self, gap: FloatArray, normal: FloatArray, relative: FloatArray, force: FloatArray, blocks: FloatArray, traction: FloatArray,
+        *, secant: bool = False,
     ) -> float:
         """Add friction to internal forces and stiffnesses, put that of the pairs in place, and return what is stored in elastic slip."""
         anchors = self._relative(np.zeros_like(self.points)) if self.anchors is None else self.anchors
@@ -139,7 +147,7 @@ class CutLips:
         tangential = TANGENTIAL * self.stiffness * self.area
         shift = relative - anchors
         return float(
-            _slipped(pressing, slope, normal, self.pairs, shift, tangential, self.friction, force, blocks, traction)
+            _slipped(pressing, slope, normal, self.pairs, shift, tangential, self.friction, secant, force, blocks, traction)
         )  # fmt: skip
 
     def _relative(self, displacement: FloatArray) -> FloatArray:
@@ -261,7 +269,9 @@ def _across(gap: FloatArray, area: FloatArray, edge: FloatArray, stiffness: Floa
 
 
 @njit(cache=True, nogil=True)
-def _slipped(pressing, slope, normal, pairs, shift, tangential, mu, force, blocks, traction):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _slipped(  # type: ignore[no-untyped-def]  # pragma: no cover
+    pressing, slope, normal, pairs, shift, tangential, mu, secant, force, blocks, traction
+):
     """Add the friction of closed pairs and its derivative, which is unsymmetric where they slide; returns the energy of elastic slip."""
     energy = 0.0
     e = np.empty(3)
@@ -286,7 +296,9 @@ def _slipped(pressing, slope, normal, pairs, shift, tangential, mu, force, block
             force[pairs[p, 1], i] += ratio * e[i]
             for j in range(3):
                 held = tangential[p] * ((1.0 if i == j else 0.0) - normal[p, i] * normal[p, j])
-                if slides:
+                if slides and secant:
+                    held *= ratio
+                elif slides:
                     held = ratio * (held - tangential[p] * e[i] * e[j] / size**2) - mu * slope[p] * e[i] * normal[p, j] / size
                 blocks[p, i, j] += held
     return energy

@@ -18,6 +18,7 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
+from naibu.mechanics.finite_elements.linear_simplices import tetrahedron_geometry
 
 Formulation = Literal["mean_dilatation", "standard"]
 TETRAHEDRA_PER_PATCH = 8
@@ -84,22 +85,38 @@ def elements(mesh: Mesh, formulation: Formulation = "mean_dilatation") -> Elemen
     """
     if formulation not in ("mean_dilatation", "standard"):
         raise InputError(f"formulation {formulation!r} is not known; use 'mean_dilatation' or 'standard'")
+    gradients, weights = _linear_tetrahedra(mesh) if mesh.cell_type == "tetra" else _isoparametric(mesh)
+    cell = np.repeat(np.arange(mesh.n_cells)[:, None], weights.shape[1], axis=1)
+    shared = formulation == "mean_dilatation"
+    if shared and mesh.cell_type == "tetra":
+        return _patches(mesh, gradients[:, 0], weights[:, 0])
+    return Elements(mesh.n_points, mesh.cells, gradients, weights, cell, shared)
+
+
+def _linear_tetrahedra(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
+    """Return gradients (m, 1, 4, 3) and volumes (m, 1): adaptive meshes ask for them at every step."""
+    volumes, gradients = tetrahedron_geometry(mesh.points, mesh.cells)
+    _require_upright(6.0 * volumes[:, None])
+    return gradients[:, None], volumes[:, None]
+
+
+def _isoparametric(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
+    """Return gradients (m, q, k, 3) and weights (m, q) of the integration points of hexahedra or quadratic tetrahedra."""
     derivatives, quadrature = _reference_element(mesh.cell_type)
-    corners = mesh.points[mesh.cells]
-    jacobian = np.einsum("qaj,mai->mqij", derivatives, corners)
+    jacobian = np.einsum("qaj,mai->mqij", derivatives, mesh.points[mesh.cells])
     determinant = np.linalg.det(jacobian)
+    _require_upright(determinant)
+    gradients = np.einsum("qaj,mqji->mqai", derivatives, np.linalg.inv(jacobian))
+    return np.ascontiguousarray(gradients), np.ascontiguousarray(determinant * quadrature)
+
+
+def _require_upright(determinant: FloatArray) -> None:
+    """Refuse cells whose Jacobian (m, q) is not positive."""
     if determinant.min() <= 0.0:
         bad = int(np.argmin(determinant.min(axis=1)))
         raise InputError(
             f"cell {bad} of the mesh is inverted or flat (Jacobian {determinant[bad].min():.3g}); reorder its nodes or repair the mesh"
         )
-    gradients = np.einsum("qaj,mqji->mqai", derivatives, np.linalg.inv(jacobian))
-    weights = np.ascontiguousarray(determinant * quadrature)
-    cell = np.repeat(np.arange(mesh.n_cells)[:, None], len(quadrature), axis=1)
-    shared = formulation == "mean_dilatation"
-    if shared and mesh.cell_type == "tetra":
-        return _patches(mesh, gradients[:, 0], weights[:, 0])
-    return Elements(mesh.n_points, mesh.cells, np.ascontiguousarray(gradients), weights, cell, shared)
 
 
 def _reference_element(cell_type: str) -> tuple[FloatArray, FloatArray]:
@@ -113,8 +130,6 @@ def _reference_element(cell_type: str) -> tuple[FloatArray, FloatArray]:
             derivatives[:, :, j] = 0.125 * _CORNERS[None, :, j] * factor[:, :, others[0]] * factor[:, :, others[1]]
         return derivatives, np.ones(8)
     barycentric = np.vstack([-np.ones(3), np.eye(3)])
-    if cell_type == "tetra":
-        return barycentric[None], np.array([1.0 / 6.0])
     a, b = 0.5854101966249685, 0.1381966011250105
     points = np.full((4, 4), b) + (a - b) * np.eye(4)
     corner = (4.0 * points - 1.0)[:, :, None] * barycentric[None]

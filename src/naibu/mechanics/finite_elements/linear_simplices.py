@@ -51,7 +51,7 @@ class Simplices:
 
     def displacement_gradients(self, displacement: FloatArray) -> FloatArray:
         """Return du_a/dX_b (m, d, d) of a displacement (n, d), mm."""
-        return np.asarray(np.einsum("mka,mkb->mab", displacement[self.cells], self.gradients))
+        return np.asarray(np.swapaxes(displacement[self.cells], 1, 2) @ self.gradients)
 
     def scattered(self, of_cells: FloatArray) -> FloatArray:
         """Return nodal sums (n, d) of values at the vertices of all cells (m, d + 1, d)."""
@@ -81,7 +81,7 @@ def simplices(mesh: Mesh, *, thickness_mm: float = 1.0, cross_section_mm2: float
     require_positive("thickness_mm", thickness_mm)
     require_positive("cross_section_mm2", cross_section_mm2)
     d = mesh.dimension
-    measures, gradients = (_tetrahedra if d == 3 else _lines_or_triangles)(mesh.points, mesh.cells)
+    measures, gradients = (tetrahedron_geometry if d == 3 else _lines_or_triangles)(mesh.points, mesh.cells)
     if not (measures > 0.0).all():
         bad = int(np.argmin(measures))
         raise InputError(f"cell {bad} has volume {measures[bad]:g} mm^{d}; number its nodes the other way round, or repair the mesh")
@@ -101,7 +101,7 @@ def _lines_or_triangles(points: FloatArray, cells: IntArray) -> tuple[FloatArray
 
 
 @njit(cache=True, error_model="numpy")
-def _tetrahedra(points, cells):  # type: ignore[no-untyped-def]  # pragma: no cover
+def tetrahedron_geometry(points, cells):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return volumes (m,) and, where they are positive, the gradients of the shape functions (m, 4, 3): cofactors of the edges."""
     volumes, gradients = np.empty(len(cells)), np.zeros((len(cells), 4, 3))
     edges = np.empty((3, 3))

@@ -20,9 +20,12 @@ class LipAssembler(Assembler):
     ----------
     lips : CutLips, optional
         Pairs of nodes on both sides.
+    secant : bool
+        Whether the tangent contains the secant of friction instead of its derivative, and is symmetric then.
     """
 
     lips: CutLips | None = None
+    secant: bool = False
     _pairs: Int32Array = field(default_factory=lambda: np.zeros((0, 2, 2), dtype=np.int32))
 
     def forces_of_parameter(self, displacement: FloatArray, direction: FloatArray) -> FloatArray:
@@ -52,7 +55,7 @@ class LipAssembler(Assembler):
         energy, force, smallest = Assembler._run(self, displacement, parameters, blocks)
         if self.lips is None:
             return energy, force, smallest
-        more, stiffness = self.lips.add(displacement, force)
+        more, stiffness = self.lips.add(displacement, force, secant=self.secant)
         if len(blocks):
             for a in range(2):
                 for b in range(2):
@@ -70,6 +73,12 @@ def going_on(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
     if not isinstance(assembler, LipAssembler) or assembler.lips is None or not assembler.unsymmetric:
         return assembler
     return replace(assembler, lips=assembler.lips.with_anchors(anchors))
+
+
+def with_secant(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
+    """Return the assembler with a symmetric tangent, of sides of cuts that have slipped to anchors (p, 3), mm; None: those at rest."""
+    moved = going_on(assembler, anchors)
+    return replace(moved, secant=True) if isinstance(moved, LipAssembler) else moved
 
 
 def with_friction(assembler: Assembler, coefficient: float) -> Assembler:

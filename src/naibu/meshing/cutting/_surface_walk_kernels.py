@@ -14,6 +14,7 @@ from naibu.meshing.cutting._surface_search_kernels import along, dot, from_to, n
 WAITING, STEPPED, LEFT, ENDED, STUCK, FULL = 0, 1, 2, 3, 4, 5
 NO_ROOM = -2
 FINEST = 4  # times that the allowed edge is halved where no edge leads on
+ONWARD, HARDLY = 0.1, 1e-3  # of an edge: how much further along the path it leads, and among flat triangles that bisection keeps flat
 
 # entries of `ToolArrays.whole`: lengths of the path and of the list of cut edges, where the cut is, and how far a movement has come
 COUNT, EDGES, NOW, AT_BOUNDARY, BEGAN, LEFT_BEFORE, FREE, PIECE, PIECES, SAMPLED = range(10)
@@ -53,7 +54,7 @@ def refine_around(s, v, bound, around):  # type: ignore[no-untyped-def]  # pragm
 
 
 @njit(cache=True)
-def _fits(s, k, r, c, size):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _fits(s, k, r, c, size, least):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the length of the path beside vertex c if the way from r leads on and stays near the path, and -1 otherwise."""
     p, m, at, distance = s.position, k.whole[COUNT], k.real[AT], k.real[DISTANCE]
     high = at + 3.0 * max(size, distance)
@@ -61,7 +62,7 @@ def _fits(s, k, r, c, size):  # type: ignore[no-untyped-def]  # pragma: no cover
     if k.length[m - 1] - at < distance:
         if _from_end2(s, k, c) >= _from_end2(s, k, r):
             return -1.0
-    elif reached <= at + 0.1 * size:
+    elif reached <= at + least * size:
         return -1.0
     if k.whole[FREE]:
         return reached
@@ -83,7 +84,7 @@ def _from_end2(s, k, v):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def _best(s, k, r, across):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _best(s, k, r, across, least):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vertex whose edge lies closest to the direction of the path, -1 if none, its triangle, corner and kind, and the length beside it."""
     count, _ = fan(s, r, k.around)
     best, reached, found, beside, which, how = 0.0, -1.0, -1, -1, 0, 0
@@ -105,10 +106,14 @@ def _best(s, k, r, across):  # type: ignore[no-untyped-def]  # pragma: no cover
             x, y, z = from_to(p, r, c)
             size = np.sqrt(dot(x, y, z, x, y, z))
             ax, ay, az = along(k.points, k.length, m, at + max(size, 0.5 * k.real[DISTANCE]))
-            ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
+            if least < ONWARD:  # along the path, not back towards it
+                bx, by, bz = along(k.points, k.length, m, at)
+                ax, ay, az = ax - bx, ay - by, az - bz
+            else:
+                ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
             cosine = dot(x, y, z, ax, ay, az) / max(size * np.sqrt(dot(ax, ay, az, ax, ay, az)), 1e-300)
             if cosine > best + (1e-9 if kind == 2 else 0.0):
-                behind = _fits(s, k, r, c, size)
+                behind = _fits(s, k, r, c, size, least)
                 if behind >= 0.0:
                     best, reached = cosine, behind
                     found, beside, which, how = c, t, i, kind
@@ -116,11 +121,11 @@ def _best(s, k, r, across):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def _next(s, k, r):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _next(s, k, r, least):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Neighbour of a vertex, or the one across the longest edge of a triangle around it, closest to the path's direction; -1 if none."""
-    found, t, i, kind, reached = _best(s, k, r, True)
+    found, t, i, kind, reached = _best(s, k, r, True, least)
     if found >= 0 and kind == 2 and not swap(s, t, i):
-        found, t, i, kind, reached = _best(s, k, r, False)
+        found, t, i, kind, reached = _best(s, k, r, False, least)
     return found, reached
 
 
@@ -139,7 +144,9 @@ def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     for h in range(FINEST + 1):
         if not free and not refine_around(s, r, distance * 0.5**h, k.around):
             return FULL
-        c, reached = _next(s, k, r)
+        c, reached = _next(s, k, r, ONWARD)
+        if c < 0 and not free and h == FINEST:
+            c, reached = _next(s, k, r, HARDLY)
         if c >= 0:
             ends_here = on_boundary(s, c, k.around)
             if not separate(s, r, c):

@@ -55,7 +55,7 @@ def chapter4_cut(seed: int = 0, *, distances: tuple[float, ...] = (3.0, 1.5, 0.7
     hand = cut_hand(seed)
     sections = (path_section(hand), distance_section(hand, distances), groove_section(hand, frames))
     settings: dict[str, Cell] = {"seed": seed, "edge of the scan, mm": EDGE_MM, "d, mm": DISTANCE_MM}
-    return Chapter("ch4-cut", "Chapter 4.2: cutting a scanned surface", sections, settings)
+    return Chapter("ch4-cut", "Chapter 4.4: cutting a scanned surface", sections, settings)
 
 
 def cut_hand(seed: int) -> HandCut:

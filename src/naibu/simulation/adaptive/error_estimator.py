@@ -1,3 +1,4 @@
+# mypy: disallow-untyped-decorators=False
 """Error indicators of linear simplices, from which cells are marked: recovery of stresses, and their jumps between cells."""
 
 from __future__ import annotations
@@ -5,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
+from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, require_shape
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
@@ -41,20 +43,35 @@ def recovery_indicators(mesh: Mesh, stress: FloatArray, shear_modulus: ArrayLike
 
 def recovered_differences(mesh: Mesh, body: Simplices, values: FloatArray) -> FloatArray:
     """Return how values of the cells (m, k) differ from their averages at the nodes (m, d + 1, k), over the cells of one region."""
-    d, m = body.dimension, body.n_cells
     number = body.cells + mesh.n_points * mesh.regions[:, None]
     count = mesh.n_points * (int(mesh.regions.max()) + 1)
-    weights = np.repeat(body.measures, d + 1)
-    total = np.bincount(number.ravel(), weights, minlength=count)
-    sums = np.stack([np.bincount(number.ravel(), weights * np.repeat(v, d + 1), minlength=count) for v in values.T], axis=1)
-    nodal = np.divide(sums, total[:, None], out=np.zeros_like(sums), where=total[:, None] > 0.0)
-    return np.asarray(nodal[number] - values.reshape(m, 1, -1))
+    return np.asarray(_differences(number, body.measures, np.ascontiguousarray(values), count))
+
+
+@njit(cache=True)
+def _differences(number, measures, values, count):  # type: ignore[no-untyped-def]  # pragma: no cover
+    m, corners = number.shape
+    k = values.shape[1]
+    total, sums = np.zeros(count), np.zeros((count, k))
+    for c in range(m):
+        for i in range(corners):
+            n = number[c, i]
+            total[n] += measures[c]
+            for a in range(k):
+                sums[n, a] += measures[c] * values[c, a]
+    out = np.empty((m, corners, k))
+    for c in range(m):
+        for i in range(corners):
+            n = number[c, i]
+            for a in range(k):
+                out[c, i, a] = sums[n, a] / total[n] - values[c, a]
+    return out
 
 
 def linear_products(body: Simplices, first: FloatArray, second: FloatArray) -> FloatArray:
     """Return the integrals (m,) of the products of two fields that are linear in every cell, given at its nodes (m, d + 1, k)."""
     d = body.dimension
-    squares = (first * second).sum(axis=(1, 2)) + (first.sum(axis=1) * second.sum(axis=1)).sum(axis=1)
+    squares = np.einsum("mik,mik->m", first, second) + np.einsum("mk,mk->m", *(np.einsum("mik->mk", gap) for gap in (first, second)))
     return np.asarray(body.measures * squares / ((d + 1) * (d + 2)))
 
 

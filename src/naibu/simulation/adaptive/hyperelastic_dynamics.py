@@ -18,16 +18,15 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import Material
-from naibu.mechanics.finite_strain.lip_assembly import with_lips
 from naibu.mechanics.finite_strain.penalties import relative_penetrations, with_less_penetration
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.viscoelasticity import HistoryVariables, PronySeries, ViscoelasticBody
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.recycled_factors import NEWTON_TOLERANCE, RecycledFactors
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
-from naibu.meshing.surface import boundary_faces
 from naibu.simulation.adaptive.body import BodyState
 from naibu.simulation.adaptive.body_contact import BodyContact
+from naibu.simulation.cut_sides import with_sides_of_cuts
 
 _MAX_NEWTON = 15
 _SUBDIVISIONS = 5  # of a step in contact that does not converge: halves, quarters, ...
@@ -96,7 +95,7 @@ class HyperelasticDynamics:
             raise InputError(f"hyperelastic dynamics needs linear tetrahedra, not {mesh.cell_type!r} cells")
         assembler = Assembler.from_materials(elements(mesh, "standard"), mesh.regions, list(self.materials))
         if self.relaxation is None and self.method == "backward_euler":
-            assembler = with_lips(assembler, mesh.points, boundary_faces(mesh).faces)
+            assembler = with_sides_of_cuts(assembler, mesh)
         viscous = None if self.relaxation is None else ViscoelasticBody.of(assembler, self.relaxation, relaxing="all")
         cell_mass = self.density * assembler.elements.weights[:, 0]
         mass = np.bincount(mesh.cells.ravel(), np.repeat(cell_mass / 4.0, 4), minlength=mesh.n_points).astype(np.float64)

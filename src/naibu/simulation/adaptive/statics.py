@@ -20,7 +20,6 @@ from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDispla
 from naibu.mechanics.finite_elements.elements import Formulation, elements
 from naibu.mechanics.finite_elements.hyperelasticity import Material, lame_parameters
 from naibu.mechanics.finite_elements.linear_simplices import lumped_mass, simplices
-from naibu.mechanics.finite_strain.lip_assembly import with_lips
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import Solution, solve
 from naibu.mechanics.linear_algebra.block_matrix import block_pattern
@@ -32,6 +31,7 @@ from naibu.meshing.surface import boundary_faces
 from naibu.simulation.adaptive.conditions import Conditions, Selection
 from naibu.simulation.adaptive.error_estimator import recovery_indicators
 from naibu.simulation.adaptive.force_error import first_piola, path_force_errors
+from naibu.simulation.cut_sides import with_sides_of_cuts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -270,7 +270,7 @@ def hyperelastic_problem(
     parts = elements(mesh, formulation)
     pattern = block_pattern(mesh.n_points, parts.connectivity, *(c.nodes for c in contacts))
     assembler = Assembler.from_materials(parts, mesh.regions, list(materials), pattern)
-    assembler = with_lips(assembler, mesh.points, boundary_faces(mesh).faces, lips_friction)
+    assembler = with_sides_of_cuts(assembler, mesh, lips_friction)
     held = PrescribedDisplacement(conditions.constrained(mesh.points), np.zeros_like(mesh.points))
     return Problem(mesh.points, assembler, contacts, held, conditions.force(mesh, lumped_mass(simplices(mesh), density)))
 

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +18,7 @@ from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.haptic_loop import LONGEST_STEP_S, HapticHand
 from naibu.simulation.haptic_thread import HapticThread
-from naibu.simulation.interactive_bodies import Frame, InteractiveBody
+from naibu.simulation.interactive_bodies import FiniteElementBody, Frame, InteractiveBody
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
 from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
@@ -145,6 +145,7 @@ def live(
     port: int = 8765,
     haptics_port: int | None = None,
     decoder: str | os.PathLike[str] | None = None,
+    lips_friction: float = 0.0,
     preparing: Callable[[], None] | None = None,
     ready: Callable[[str], None],
 ) -> None:
@@ -164,6 +165,8 @@ def live(
         UDP port of the loopback interface for a haptic device, which then leads the tool.
     decoder : path-like, optional
         Of a fingertip: ``NAME-decoder.json`` of its simulation.
+    lips_friction : float
+        Coulomb's coefficient between the two sides of a cut, of finite elements.
     preparing : callable, optional
         Called before kernels are compiled and factors made, which takes a minute on a first run. From then on a haptic device is
         answered, without force until all is ready.
@@ -173,8 +176,10 @@ def live(
     Raises
     ------
     InputError
-        A source that cannot be used, or a port that is taken.
+        A source that cannot be used, a port that is taken, or friction of a body whose sides of cuts do not touch each other.
     """
+    if not (np.isfinite(lips_friction) and lips_friction >= 0.0):
+        raise InputError(f"lips_friction must be a finite number that is not negative, not {lips_friction:g}; 0 is frictionless")
     if not 0 <= port <= 65535:
         raise InputError(f"port must lie between 0 and 65535, not {port}")
     if haptics_port is not None and not 1 <= haptics_port <= 65535:
@@ -185,7 +190,7 @@ def live(
         with waiting_device(hand):
             if preparing is not None:
                 preparing()
-            model = _touchable(source, experiment, material, decoder)
+            model = _rubbing(_touchable(source, experiment, material, decoder), lips_friction)
             simulation = _prepared(model, hand)
         with _stepped(simulation, hand) as loop:
             serve(LiveServer(LiveSimulation(model, loop)), bound, ready)
@@ -203,6 +208,15 @@ def _touchable(
     if material is not None:
         raise InputError(f"material goes with a mesh, and {source} is a fingertip, whose file tells its gel; leave it out")
     return touchable_fingertip(source, decoder)
+
+
+def _rubbing(model: TouchableModel, friction: float) -> TouchableModel:
+    """Return the model whose sides of cuts to come rub on each other; the same where there is no friction."""
+    if friction == 0.0:
+        return model
+    if not (model.cuttable and isinstance(model.body, FiniteElementBody)):
+        raise InputError(f"lips_friction must be 0, not {friction:g}: this is no body of finite elements that can be cut")
+    return replace(model, body=replace(model.body, lips_friction=friction))
 
 
 @contextmanager

@@ -90,7 +90,8 @@ class CondensedContact:
         return tangent is self.tangent and bool(np.isin(nodes, self.nodes, assume_unique=True).all())
 
     def forces(
-        self, free: FloatArray, law: ContactLaw, begin: FloatArray, tolerance_mm: float, longest_mm: float, faint_mn: float
+        self, free: FloatArray, law: ContactLaw, begin: FloatArray, tolerance_mm: float, longest_mm: float, faint_mn: float,
+        most: int = CHANGES,
     ) -> Generator[None, None, FloatArray]:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.
 
@@ -110,6 +111,8 @@ class CondensedContact:
             Motion in one iteration at most, mm: no node may pass through an indenter.
         faint_mn : float
             Forces so small, mN, that it does not matter by how much they are wrong.
+        most : int
+            Matrices at most.
         """
         at = best = begun = self._tried(begin, begin, free, law)
         evaluations, changes, steps, mixing = 1, 0, 0, AndersonMixing(DEPTH)
@@ -118,7 +121,7 @@ class CondensedContact:
             if at.size <= tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, begin, law, BALANCED, faint_mn):
                 break
             if self._changed is None or useless:
-                if changes == CHANGES or self._consistent(at, begin, law, ENOUGH, faint_mn):
+                if changes == most or self._consistent(at, begin, law, ENOUGH, faint_mn):
                     break
                 yield
                 if changes == UNAIDED and not self._springs.any() and len(held := law.opened().nodes):

@@ -1,7 +1,8 @@
-"""Pairs of the two sides of cuts that open or close in a step, beside their stiffness in the tangent of an earlier state.
+"""Pairs of the two sides of cuts that open, close, stick or slip in a step, beside their stiffness in the tangent of an earlier state.
 
 A tangent of then holds closed what was closed then. Pairs whose state has changed since, or may change, are taken out of it, and their
 contact is solved as it is, condensed to their nodes like that of indenters (`naibu.mechanics.finite_strain.sessions.condensed_contact`).
+Friction has the stiffness of its secant in both, which is symmetric.
 """
 
 from __future__ import annotations
@@ -10,13 +11,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.mechanics.contact.cut_lips import CutLips
+from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact.cut_lips import TANGENTIAL, CutLips
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
 MOST = 80  # pairs in a step
 AHEAD = 40  # pairs for which the inverse is prepared
+OTHERWISE = 0.3  # of the stiffness of a pair that sticks: change of that of friction from which a pair is taken out
 NEAR = 0.1  # of the edge: gaps, and penetrations, from which pairs are not expected to change
 
 
@@ -45,13 +47,13 @@ class LipsBesideTangent:
 
     def __post_init__(self) -> None:
         self._before = np.zeros_like(self.displacement)
-        self._now = self.lips.add(self.displacement, self._before)[1]
+        self._now = self.lips.add(self.displacement, self._before, secant=True)[1]
 
     def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the change of the forces up to a displacement (n, 3), mm, to `force` (n, 3), mN."""
         first, second = self.lips.pairs.T
         internal = -self._before
-        self._now = self.lips.add(displacement, internal)[1]
+        self._now = self.lips.add(displacement, internal, secant=True)[1]
         motion = displacement - self.displacement
         known = np.einsum("pij,pj->pi", self.earlier, motion[first] - motion[second])
         np.add.at(internal, first, -known)
@@ -70,7 +72,7 @@ class LipsBesideTangent:
                 np.add.at(blocks, places[:, a, b], (1.0 if a == b else -1.0) * (self._now - self.earlier))
 
     def add_secant_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
-        """Add what `add_stiffness` adds: there is no friction."""
+        """Add what `add_stiffness` adds: that of friction is its secant."""
         self.add_stiffness(pattern, positions, blocks)
 
 
@@ -92,10 +94,21 @@ def changing_lips(lips: CutLips, tangent: EarlierTangent, displacement: FloatArr
     then = tangent.lips.any(axis=(1, 2))
     known = tangent.factors.covered(lips.pairs).all(axis=1)
     changed = (then != (before < 0.0)) | (known & (then != (after < 0.0)))
+    if lips.friction > 0.0:
+        changed |= _rubs_otherwise(lips, tangent, displacement) | (known & _rubs_otherwise(lips, tangent, displacement + free))
     close = np.minimum(np.abs(before), np.abs(after)) / lips.edge
     chosen = np.flatnonzero(changed | (known & (close < NEAR)))
     chosen = np.sort(chosen[np.lexsort((close[chosen], ~changed[chosen]))][:MOST]).astype(np.int64)
     return LipsBesideTangent(lips.only(chosen), chosen, displacement, tangent.lips[chosen])
+
+
+def _rubs_otherwise(lips: CutLips, tangent: EarlierTangent, displacement: FloatArray) -> BoolArray:
+    """Return which pairs (p,) resist slip at a displacement otherwise than in a tangent."""
+    now = lips.add(displacement, np.zeros_like(displacement), secant=True)[1]
+    assert lips.normals is not None
+    change = now - tangent.lips
+    along = np.trace(change, axis1=1, axis2=2) - np.einsum("pi,pij,pj->p", lips.normals, change, lips.normals)
+    return np.asarray(np.abs(along) > 2.0 * OTHERWISE * TANGENTIAL * lips.stiffness * lips.area)
 
 
 def lips_about_to_change(lips: CutLips, displacement: FloatArray) -> IntArray:

@@ -8,9 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.core.errors import InputError
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
-from naibu.mechanics.finite_strain.lip_assembly import lips_of
+from naibu.mechanics.finite_strain.lip_assembly import lips_of, with_secant
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool
@@ -43,10 +42,6 @@ class RealTimeModel(DynamicEngine):
 
     def __post_init__(self) -> None:
         DynamicEngine.__post_init__(self)
-        if self.assembler.unsymmetric:
-            raise InputError(
-                "lips_friction must be 0 in real time; `DynamicEngine` and `QuasiStaticEngine` take friction between sides of cuts"
-            )
         object.__setattr__(self, "_elements", PressureElements.of(self.assembler))
         pairs = np.concatenate([np.zeros((0, 2), np.int64), *(lips.pairs for lips in lips_of(self.assembler))])
         object.__setattr__(self, "_surface", block_pattern(len(self.points), self.faces, pairs))
@@ -69,7 +64,9 @@ def _mean_edges(points: FloatArray, faces: IntArray) -> FloatArray:
     return np.asarray(np.bincount(ends, both, minlength=len(points)) / np.maximum(count, 1))
 
 
-def tangent_at(engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: IntArray, ahead: IntArray) -> EarlierTangent:
+def tangent_at(
+    engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: IntArray, ahead: IntArray, slipped: FloatArray | None
+) -> EarlierTangent:
     """Return the tangent at a displacement, and columns of its inverse for the nodes that come into contact.
 
     Parameters
@@ -84,8 +81,11 @@ def tangent_at(engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: I
         Nodes that do not move.
     ahead : ndarray, shape (a,), int64
         Nodes in contact or about to be.
+    slipped : ndarray, shape (p, 3), optional
+        Frictional anchors of the sides of cuts, mm; by default those at rest.
     """
-    pattern, blocks = engine.assembler.pattern, engine.assembler.evaluate(u)[2]
+    assembler = with_secant(engine.assembler, slipped)
+    pattern, blocks = assembler.pattern, assembler.evaluate(u)[2]
     contact = np.zeros((engine._surface.n_blocks, 3, 3))
     for some, place, all_places in zip(*contacts, strict=False):
         some.add_symmetric_stiffness(pattern, all_places, blocks)
@@ -97,5 +97,5 @@ def tangent_at(engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: I
     factors = UpdatedFactors(solver.factorize(with_dirichlet_rows(pattern.matrix(blocks), fixed)), len(u))
     factors.prepare(ahead)
     touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
-    lips = np.concatenate([np.zeros((0, 3, 3)), *(some.add(u, np.zeros_like(u))[1] for some in lips_of(engine.assembler))])
+    lips = np.concatenate([np.zeros((0, 3, 3)), *(some.add(u, np.zeros_like(u), secant=True)[1] for some in lips_of(assembler))])
     return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, lips, solver, u)

@@ -24,7 +24,7 @@ from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
-from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact, ContactBesideTangent
+from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import changing_lips
@@ -46,6 +46,7 @@ UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is 
 SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 STIFFEST = 16.0  # times the first penalty, to which penalties rise: stiffer ones need more iterations
+RUBBING = 3  # matrices for contacts in an iteration where sides of cuts rub: many stick or slip by turns, and the iterations find them
 RAISE = 1.3  # of a penalty in a step; where it leaps, pressure and limit of friction do, and the surface slips to another equilibrium
 
 
@@ -119,6 +120,7 @@ class RealTimeSession(TangentSession):
         """Go on from a state; see `DynamicSession.restore`."""
         DynamicSession.restore(self, state)
         self._pressure, self._near, self._gaps, self._trial, self._search = None, (), (), None, None
+        self._slipped = self.reached.lips
 
     @property
     def under_way(self) -> bool:
@@ -193,7 +195,7 @@ class RealTimeSession(TangentSession):
     def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, Trial | None]:
         """Return the balance at the end of a step, or None; yields where one may go on later."""
         tangent, start, h = self._current_tangent(), self.reached, self.engine.step
-        self._elements = replace(self._engine._elements, assembler=self.engine.assembler.in_step(start.displacement))
+        self._elements = replace(self._engine._elements, assembler=self.engine.assembler.in_step(start.displacement, start.lips))
         inertial = start.displacement + h * start.velocity
         travel = [float(np.linalg.norm(c.stop - c.start)) for c in contacts]
         fastest = h * float(np.sqrt((start.velocity**2).sum(axis=1).max()))
@@ -333,7 +335,8 @@ class RealTimeSession(TangentSession):
         for near in self._near:
             near.add_force(u, contact)
         residual, allowed = self._implicit_step(engine.step, ()).balance(u, balance, contact)
-        wrong, touching = float(np.abs(residual).sum()), float(np.abs(contact).sum())
+        rubbing = sum(some.rubbing(u) for some in lips_of(self._elements.assembler))
+        wrong, touching = float(np.abs(residual).sum()), float(np.abs(contact).sum()) + rubbing
         balance += (engine.mass / engine.step**2)[:, None] * (u - inertial) - self.external_force
         error = wrong / (float(allowed) / engine.tolerance + touching)
         felt = wrong / (touching + engine.faint_mn) if touching else 0.0
@@ -374,14 +377,15 @@ class RealTimeSession(TangentSession):
                 begin[carried] = self.reached.displacement[carried] + way - trial.displacement[carried]
             extent, faint = self.engine._extent, self._engine.faint_mn
             longest = min(0.05 * extent, float(harmless_ways(self.indenters).min(initial=np.inf)))
-            force = yield from condensed.forces(free[nodes], law, begin[nodes], 1e-5 * extent, longest, faint)
+            most = RUBBING if self.engine.assembler.unsymmetric else CHANGES
+            force = yield from condensed.forces(free[nodes], law, begin[nodes], 1e-5 * extent, longest, faint, most)
             tangent.factors.add_columns(nodes, force, x)
         free[self._constrained] = 0.0
         return free
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
-        trial = self._trial
+        trial, self._slipped = self._trial, self.reached.lips
         if trial is None:
             return DynamicSession._accepted(self, h, u, contacts, spin)
         of_indenters, anchors, gaps = np.zeros((len(contacts), 3)), [], []

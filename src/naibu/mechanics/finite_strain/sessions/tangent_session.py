@@ -42,6 +42,7 @@ class TangentSession(DynamicSession):
     _condensed: CondensedContact | None = field(init=False, default=None)
     _seen: FloatArray | None = field(init=False, default=None)
     _age: int = field(init=False, default=0)
+    _slipped: FloatArray | None = field(init=False, default=None)  # anchors of the sides of cuts when the last step began
     _until: float = field(init=False, default=np.inf)  # processor time at which a step is left to the next call
 
     def keep_tangent(self) -> None:
@@ -81,7 +82,7 @@ class TangentSession(DynamicSession):
         still = np.zeros((len(self._templates), 3))
         contacts = self._contacts(0.0, still, still)  # where indenters are now
         gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in contacts]
-        return self._made(u, (), (), self._held(), self._soon_touched(contacts, gaps))
+        return self._made(u, (), (), self._held(), self._soon_touched(contacts, gaps), self._slipped if u.any() else None)
 
     def _renew(self, ahead: IntArray) -> None:
         """Have a tangent made of the state reached, if anything has changed since the last one."""
@@ -93,9 +94,9 @@ class TangentSession(DynamicSession):
             return
         self._seen = u
         if self._engine.background:
-            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead))
+            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped))
         else:
-            self._keep(self._made(u, self._near, self._places, self._held(), ahead))
+            self._keep(self._made(u, self._near, self._places, self._held(), ahead, self._slipped))
 
     def _renewed(self) -> Generator[None, None, EarlierTangent]:
         """Return the tangent of the state reached, which the step waits for; the thread makes it where there is no time."""
@@ -105,7 +106,7 @@ class TangentSession(DynamicSession):
             near.add_force(u, np.zeros_like(u))
             gaps.append(np.full(len(contact.nodes), np.inf))
             gaps[-1][near.points] = near.gap
-        make = partial(self._made, u, self._near, self._places, self._held(), self._soon_touched(self._templates, gaps))
+        make = partial(self._made, u, self._near, self._places, self._held(), self._soon_touched(self._templates, gaps), self._slipped)
         if not self._engine.background or self._until == np.inf:
             return self._used(self._keep(make()))
         while not self._thread.idle:
@@ -140,10 +141,14 @@ class TangentSession(DynamicSession):
         return self.bodies[0] if self.bodies else np.zeros(0, np.int64)
 
     def _made(
-        self, u: FloatArray, near: tuple[NearbyContact, ...], places: tuple[Int32Array, ...], held: IntArray, ahead: IntArray
+        self, u: FloatArray, near: tuple[NearbyContact, ...], places: tuple[Int32Array, ...], held: IntArray, ahead: IntArray,
+        slipped: FloatArray | None,
     ) -> EarlierTangent:
-        """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`."""
-        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead)
+        """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`.
+
+        Of sides of cuts that slide, its secant is that of a step that began with these anchors: at the end of a step they have slipped.
+        """
+        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead, slipped)
 
     def _release(self, tangent: EarlierTangent | None) -> None:
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
