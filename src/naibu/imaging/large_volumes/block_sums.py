@@ -19,7 +19,7 @@ from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.volume_pair import shifted_intensity
 from naibu.imaging.volume_correlation.block_displacements import DRAWS, RIM, BlockSums, below_surface, sums_of_blocks
 from naibu.imaging.volume_correlation.common_content import content_sums
-from naibu.imaging.volume_correlation.gauss_newton import FORCES_AT_ONCE, CorrelationFit
+from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.image_level import ENOUGH, MARGIN, GainMap, ImageLevel
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import lagged_products
@@ -48,6 +48,8 @@ class FieldState:
         Gain and offset at the points of their lattice.
     residual_sd : float
         Standard deviation of the residual.
+    jitter_voxels : float
+        Sub-voxel jitter SD.
     reliability : ndarray, shape (CZ, CY, CX, 3, 3), float32
         Matrices by which gradients are multiplied.
     draws : int
@@ -64,6 +66,7 @@ class FieldState:
     coefficients: FloatArray
     gain: FloatArray
     residual_sd: float
+    jitter_voxels: float
     reliability: Float32Array
     draws: int
     lagged: bool
@@ -81,6 +84,8 @@ class ComparedBlock:
         Voxels in the deformed volume, and all of them.
     classes : ndarray
         Numbers of absolute residuals, in residual SD, in the classes `CLASSES`.
+    jitter : float
+        Square of the observed sub-voxel jitter, voxels^2, times the voxels that are seen; 0 but for a step.
     robust : tuple of float
         See `IntensityComparison.robust_sums`.
     moments : ndarray, shape (5,)
@@ -104,6 +109,7 @@ class ComparedBlock:
     seen: int
     voxels: int
     classes: IntArray
+    jitter: float
     robust: tuple[float, float]
     moments: FloatArray
     gain_matrix: FloatArray
@@ -150,7 +156,8 @@ def compared_block(
     grid = part.grid
     first = np.array([low for low, _ in block.cells])
     fit.compare(_local_coefficients(state.coefficients, block))
-    soft = ~part.rigid[part.mask]
+    soft, seen = ~part.rigid[part.mask], int(fit.seen.sum())
+    jitter = fit.observed_jitter_voxels**2 * seen if state.stage == "step" else 0.0
     for values in (fit.products, fit.force, fit.gradient):
         values[~soft] = 0
     m = len(fit.system.cells)
@@ -162,7 +169,7 @@ def compared_block(
     products, pairs = (np.zeros(0),) * 2 if weighted is None else (lags(v) for v in lagged_products(part.mask, weighted))
     at_end = state.stage == "covariance"
     return ComparedBlock(
-        int(fit.seen.sum()), len(fit.value), _classes(fit), fit.robust_sums, _moments(fit), *gain,
+        seen, len(fit.value), _classes(fit), jitter, fit.robust_sums, _moments(fit), *gain,
         np.stack(fit.system.nodes, axis=1) + first[::-1], fit.system.cells[:, 2:] + first[::-1],
         fit.system.matrix if solving else fit.system.matrix[:0], load, _random_loads(fit, part.mask, state, block),
         fit.cell_agreement(), content_sums(fit, part.depth(fit.level)) if at_end else np.zeros((m, 0)),
@@ -176,6 +183,7 @@ class _BlockFit(CorrelationFit):
 
     def __init__(self, level: ImageLevel, system: SplineSystem, frame: BlockFrame, state: FieldState, at: Box, corner: IntArray) -> None:
         super().__init__(level, system, frame.settings, noisy=True)
+        self.jitter_voxels = state.jitter_voxels
         self.lattice, self.model = GainMap(level, 1.0), state
         # of coarse voxels, here in voxels from the corner of the part
         self.lattice.low = frame.gain_low * frame.factor + frame.offset - corner
@@ -301,7 +309,6 @@ def _moments(fit: CorrelationFit) -> FloatArray:
 
 def _random_loads(fit: CorrelationFit, mask: BoolArray, state: FieldState, block: Block) -> Float32Array:
     """Return loads (k, 3, s) of random residuals."""
-    out = np.zeros((fit.system.n, 3, state.draws), np.float32)
     rng, level = np.random.default_rng((state.seed, block.number)), fit.level
     # where residuals are independent, some hundred voxels of a cell have loads distributed as those of all
     share = 1.0 if state.tiles else min(1.0, ENOUGH_IN_CELL / float(np.prod(fit.system.grid.step_mm / level.spacing)))
@@ -309,14 +316,9 @@ def _random_loads(fit: CorrelationFit, mask: BoolArray, state: FieldState, block
     number = np.full(mask.shape, -1, np.int32)
     number[tuple(a[some] for a in np.nonzero(mask))] = np.arange(int(some.sum()))
     sensitivity = fit.gradient[some] * np.sqrt(fit.weight[some] / np.float32(share))[:, None]
-    for first in range(0, state.draws, FORCES_AT_ONCE):
-        forces = np.empty((*sensitivity.shape, min(FORCES_AT_ONCE, state.draws - first)), np.float32)
-        for j in range(forces.shape[2]):
-            tiles = state.tiles
-            random = tiles.window(mask, block.number, first + j) if tiles else rng.standard_normal(len(sensitivity), dtype=np.float32)
-            np.multiply(sensitivity, random[:, None], out=forces[:, :, j])
-        out[:, :, first : first + FORCES_AT_ONCE] = fit.system.force_loads(forces, number)
-    return out
+    tiles, draws = state.tiles, range(state.draws)
+    random = (tiles.window(mask, block.number, k) if tiles else rng.standard_normal(len(sensitivity), dtype=np.float32) for k in draws)
+    return fit.system.random_loads(sensitivity, random, number)
 
 
 def _small_blocks(fit: CorrelationFit, part: _Part, tiles: NoiseTiles, draws_before: int, soft: BoolArray) -> BlockSums:

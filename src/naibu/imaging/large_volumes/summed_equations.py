@@ -50,7 +50,7 @@ class Model:
         Of the displacement, mm.
     bending, dilatation : ndarray, shape (m, 3), and float
         Weights of the penalties.
-    gain, residual_sd, reliability
+    gain, residual_sd, jitter_voxels, reliability
         See `FieldState`; the reliability is that of the m cells.
     products, pairs : ndarray, optional
         Sums of products of residuals, and their numbers, by distance.
@@ -65,6 +65,7 @@ class Model:
     dilatation: float
     gain: FloatArray
     residual_sd: float
+    jitter_voxels: float
     reliability: Float32Array
     products: AnyFloatArray | None = None
     pairs: AnyFloatArray | None = None
@@ -94,8 +95,9 @@ class SummedEquations:
         matrix, load = self.lattice.normal_equations(fit.value, fit.robust_weight)
         reliability = fit.reliability_of(fit.cell_agreement())
         self.model = Model(
-            coarse.c, coarse.bending, coarse.dilatation, self._gain(matrix, load, fit.residual_sd, everywhere), fit.residual_sd, reliability
-        )
+            coarse.c, coarse.bending, coarse.dilatation, self._gain(matrix, load, fit.residual_sd, everywhere), fit.residual_sd,
+            coarse.settings.jitter_sd_voxels, reliability,
+        )  # fmt: skip
 
     def _frame(self, factor: int) -> BlockFrame:
         coarse, level, s = self.coarse, self.fit.level, self.coarse.settings
@@ -141,7 +143,7 @@ class SummedEquations:
         if stage == "covariance" and model.products is not None and model.pairs is not None:
             tiles = NoiseTiles.for_blocks(edges, seed, model.products, model.pairs)
         lagged = stage == "step" and model.passes + 1 >= LEAST_PASSES
-        return FieldState(stage, model.coefficients, model.gain, model.residual_sd, dense, draws, lagged, tiles, seed + model.passes)
+        return FieldState(stage, model.coefficients, model.gain, model.residual_sd, model.jitter_voxels, dense, draws, lagged, tiles, seed + model.passes)
 
     @property
     def adapting(self) -> bool:
@@ -165,8 +167,11 @@ class SummedEquations:
             self._adapt(sums, before)
         self._settle(sums, before)
         self._take_step(before)
+        jitter = self.model.jitter_voxels
+        if self.adapting and passes == ADAPTED_PASS - 1:
+            jitter = self.fit.bounded_jitter(float(np.sqrt(sums.jitter / sums.seen)))
         return replace(
-            self._with_intensities(sums), coefficients=coarse.c, bending=coarse.bending, dilatation=coarse.dilatation, passes=passes,
+            self._with_intensities(sums), jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending, dilatation=coarse.dilatation, passes=passes,
             settled=passes >= LEAST_PASSES and self.fit.moving_fraction <= UNSETTLED, products=sums.products, pairs=sums.pairs,
         )  # fmt: skip
 
@@ -269,11 +274,9 @@ class SummedEquations:
         for first in range(0, draws.shape[2], SAMPLES_AT_ONCE):
             some = slice(first, first + SAMPLES_AT_ONCE)
             loads = draws[:, :, some].copy()
-            for k in range(loads.shape[2] if noise is not None else 0):
-                force, random = np.zeros_like(self.fit.force), noise.draw(rng) if noise is not None else self.fit.residual
-                for inclusion in coarse.inclusions:
-                    inclusion.perturb(force, random, rng)
-                loads[:, :, k] += system.force_loads(force[:, :, None])[:, :, 0]
+            if noise is not None:
+                randoms = (noise.draw(rng) for _ in range(loads.shape[2]))
+                loads += self.fit.inclusion_loads([[inclusion.perturbed(r, rng) for inclusion in coarse.inclusions] for r in randoms])
             system.add_penalty_noise(loads, coarse.c, coarse.bending, dilatation, rng)
             out[:, :, some] = system.solved_many(loads, SAMPLE_TOLERANCE)[0]
         return out
@@ -301,7 +304,7 @@ class _Sums:
     """Sums over blocks: see `ComparedBlock`."""
 
     def __init__(self, nodes: int, cells: int) -> None:
-        self.seen, self.voxels, self.robust = 0, 0, np.zeros(2)
+        self.seen, self.voxels, self.jitter, self.robust = 0, 0, 0.0, np.zeros(2)
         self.matrix, self.load = np.zeros((nodes, 3, 1029), np.float32), np.zeros((nodes, 3), np.float32)
         self.classes, self.moments = np.zeros(len(CLASSES) + 1, np.int64), np.zeros(5)
         self.agreement, self.cells = np.zeros((cells, 12)), cells
@@ -316,6 +319,7 @@ class _Sums:
         if self.content.shape[1] != block.content.shape[1]:
             self.content = np.zeros((self.cells, block.content.shape[1]))
         self.seen, self.voxels = self.seen + block.seen, self.voxels + block.voxels
+        self.jitter += block.jitter
         self.robust, self.moments = self.robust + block.robust, self.moments + block.moments
         self.classes += block.classes
         self.gain_matrix, self.gain_load = self.gain_matrix + block.gain_matrix, self.gain_load + block.gain_load

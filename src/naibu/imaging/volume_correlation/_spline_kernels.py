@@ -200,7 +200,7 @@ def _gather(c: AnyArray, cell: AnyArray, local: AnyArray) -> None:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _clear(load: AnyArray) -> None:
+def clear(load: AnyArray) -> None:
     """Fill load with zeros; within a parallel kernel that would become a loop of its own, which takes seconds to compile."""
     load[:] = F(0)
 
@@ -238,7 +238,7 @@ def assemble(
                 for a in range(3):
                     box[2 * a], box[2 * a + 1] = starts[a][cell[4 - a]], starts[a][cell[4 - a] + 1]
                 _gather(c, cell, local)
-                _clear(load)
+                clear(load)
                 found = _moments(products, force, which, box, weights[0], weights[1], weights[2], m1, m2, m3, f1, f2, load)
                 _add_bending(local, stiffness, bending[m], load, bending_energy[m])
                 if dilatation[m] > 0:
@@ -274,37 +274,17 @@ def product(big: AnyArray, neighbours: AnyArray, x: AnyArray, y: AnyArray) -> No
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _add_scaled(w: Any, x: AnyArray, y: AnyArray) -> None:
+def add_scaled(w: Any, x: AnyArray, y: AnyArray) -> None:
     """Add w x to y (k,); loops around it have bounds that the compiler does not know, so that it is not unrolled many times."""
     for k in range(len(x)):
         y[k] += w * x[k]
 
 
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def products_of_many(big: AnyArray, neighbours: AnyArray, x: AnyArray, y: AnyArray) -> None:
-    """Fill y (n, 3, s) with A x of s vectors at once; x (n + 1, 3, s)."""
-    n = big.shape[0]
-    for t in prange(CHUNKS):
-        for p in range(t * n // CHUNKS, (t + 1) * n // CHUNKS):
-            _row_products(big[p], neighbours[p], x, y[p])
-
-
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _row_products(rows: AnyArray, neighbours: AnyArray, x: AnyArray, sums: AnyArray) -> None:
-    """Fill sums (3, s) with the products of three rows (3, 1029)."""
-    n, samples = len(x) - 1, x.shape[2]
-    sums[:] = F(0)
-    for o in range(len(neighbours)):
-        q = neighbours[o]
-        if q == n:
-            continue
-        for j in range(x.shape[1]):
-            a0, a1, a2 = rows[0, 3 * o + j], rows[1, 3 * o + j], rows[2, 3 * o + j]
-            for s in range(samples):
-                v = x[q, j, s]
-                sums[0, s] += a0 * v
-                sums[1, s] += a1 * v
-                sums[2, s] += a2 * v
+def add_scaled(w: Any, x: AnyArray, y: AnyArray) -> None:
+    """Add w x to y (k,); loops around it have bounds that the compiler does not know, so that it is not unrolled many times."""
+    for k in range(len(x)):
+        y[k] += w * x[k]
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -320,18 +300,18 @@ def _add_forces(
                 p = which[z, y, x]
                 if p >= 0:
                     for a in range(wx.shape[1]):
-                        _add_scaled(wx[x, a], forces[p], f1[a])
+                        add_scaled(wx[x, a], forces[p], f1[a])
             for a in range(len(f2)):
-                _add_scaled(wy[y, a >> 2], f1[a & 3], f2[a])
+                add_scaled(wy[y, a >> 2], f1[a & 3], f2[a])
         for a in range(len(load)):
-            _add_scaled(wz[z, a >> 4], f2[a & 15], load[a])
+            add_scaled(wz[z, a >> 4], f2[a & 15], load[a])
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _scatter(load: AnyArray, cell: AnyArray, slot: AnyArray, loads: AnyArray) -> None:
+def scatter(load: AnyArray, cell: AnyArray, slot: AnyArray, loads: AnyArray) -> None:
     """Add the load (64, 3 s) of a cell to loads (n, 3 s)."""
     for a in range(len(load)):
-        _add_scaled(F(1), load[a], loads[slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]])
+        add_scaled(F(1), load[a], loads[slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]])
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -347,9 +327,9 @@ def add_forces(
                 cell = cells[m]
                 for a in range(3):
                     box[2 * a], box[2 * a + 1] = starts[a][cell[4 - a]], starts[a][cell[4 - a] + 1]
-                _clear(load)
+                clear(load)
                 _add_forces(forces, which, box, weights[0], weights[1], weights[2], f1, f2, load)
-                _scatter(load, cell, slot, loads)
+                scatter(load, cell, slot, loads)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -359,7 +339,7 @@ def _add_dilatation(cof: AnyArray, gradients: AnyArray, t: Any, draws: AnyArray,
     for a in range(len(load)):
         for i in range(len(cof)):
             w = t * (cof[i, 0] * gradients[0, a] + cof[i, 1] * gradients[1, a] + cof[i, 2] * gradients[2, a])
-            _add_scaled(w, draws, load[a, i * samples : (i + 1) * samples])
+            add_scaled(w, draws, load[a, i * samples : (i + 1) * samples])
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -381,7 +361,7 @@ def add_noise(
                     for q in range(len(gradients)):
                         _cofactor(local, gradients, q, cof)
                         _add_dilatation(cof, gradients[q], F(np.sqrt(dilatation[m])), dilatation_draws[m, q], load)
-                _scatter(load, cells[m], slot, loads)
+                scatter(load, cells[m], slot, loads)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -391,7 +371,7 @@ def _energy_of_samples(xl: AnyArray, stiffness: AnyArray, d: AnyArray) -> Any:
     for a in range(len(xl)):
         d[:] = F(0)
         for b in range(len(xl)):
-            _add_scaled(stiffness[a, b], xl[b], d)
+            add_scaled(stiffness[a, b], xl[b], d)
         e += _squares(d, xl[a])
     return e
 
@@ -411,7 +391,7 @@ def _dilatation_of_samples(cof: AnyArray, gradients: AnyArray, xl: AnyArray, d: 
     for i in range(len(xl)):
         for a in range(xl.shape[1]):
             w = cof[i, 0] * gradients[0, a] + cof[i, 1] * gradients[1, a] + cof[i, 2] * gradients[2, a]
-            _add_scaled(w, xl[i, a], d)
+            add_scaled(w, xl[i, a], d)
     return _squares(d, d)
 
 

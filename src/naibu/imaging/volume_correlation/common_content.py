@@ -20,7 +20,7 @@ from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 LEAST_AGREEMENT = 0.05
 # the same in a window of a few cells, without the surface: by chance up to 0.25, in the leg under three times its
 # noise 0.44 or more; below, a cell has no texture, or not the same in both volumes
-MATCHED, LEAST_MATCHED = 0.3, 0.75
+MATCHED, LEAST_MATCHED = 0.3, 0.8
 # where the residual has the structure of an image, noise does not explain that gradients agree little: a strain too large to be followed
 # leaves 0.28 to 0.5, good fits of legs, chests and small balls 0.7 or more
 MATCHED_IF_STRUCTURED, MUCH_STRUCTURE = 0.6, 0.25
@@ -105,8 +105,12 @@ def content_sums(fit: CorrelationFit, depth_mm: Float32Array) -> FloatArray:
     """Return sums (m, 8) over the voxels of every cell, from which `content_of` follows."""
     inside = depth_mm > SURFACE * float(fit.system.grid.step_mm.mean())
     traces = np.stack([fit.agreement[:, axes].sum(axis=1) for axes in ([0, 3, 5], [6, 9, 11])], axis=1)
+    # steep edges show an outline, also that of another object: they count by the jitter of the settings, however well they fit
+    voxel, precision = float(fit.level.spacing.mean()), fit.residual_sd**-2 * traces[:, 1] / np.maximum(fit.weight, 1e-30)
+    lower = (1 + (fit.jitter_voxels * voxel) ** 2 * precision) / (1 + (fit.settings.jitter_sd_voxels * voxel) ** 2 * precision)
+    traces *= lower[:, None]
     every = np.column_stack([traces, np.ones(len(traces))])
-    residual = fit.residual * np.sqrt(fit.weight)
+    residual = fit.residual * np.sqrt(fit.weight * lower)
     columns = [*every.T, *(every * inside[:, None]).T, _lagged(fit, residual), residual**2]
     sums = np.zeros((len(fit.system.cells), len(columns)))
     add_to_cells(fit.cell_of_voxel, np.stack(columns, axis=1), sums)

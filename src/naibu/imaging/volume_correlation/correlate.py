@@ -30,7 +30,7 @@ from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.preprocessing.volume_pair import intensity_pair
 from naibu.imaging.volume_correlation.block_displacements import block_displacements
 from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated
-from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit, Iterations, chosen_weights
+from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit, Iterations, cell_kinds, chosen_weights
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
@@ -58,6 +58,9 @@ WEIGHT_WINDOW = 1.9  # cells: standard deviation of the window in which cells sh
 ADAPTATION_SAMPLES, ADAPTATIONS = 12, 4  # random fields of a round, and rounds, in which the weights are adapted
 INCLUSION_STEPS, ADAPTED_STEPS = 3, 5  # Gauss-Newton steps with rigid inclusions, and after each adaptation
 UNSETTLED = 0.05  # fraction of the cells that still move, above which these steps go on: large strains of small volumes need more
+MOST_STIFFER = 2.0  # median factor on the weights of bending, above which they are adapted once more
+# the last steps are solved more exactly: what is left of a step is an error like any other
+POLISH = Iterations(2, stop_voxels=0.003, tolerance=0.02)
 LEAST_WEIGHT = 1e-3  # of the dilatation weight of the round before
 DEFAULT = CorrelationSettings()
 
@@ -286,7 +289,7 @@ class Correlation:
         fit = self.fit
         if self.inclusions:
             self.c = fit.iterate(self.c, self.bending, self.dilatation * fit.system.gauss_volume, Iterations(INCLUSION_STEPS))
-        self.kinds = _kinds(fit, self.inclusions)
+        self.kinds = cell_kinds(fit)
         self.most_dilatation = self.dilatation / (FIRST_DILATATION * self.dilatation_factor)
 
     def adapt(self) -> None:
@@ -295,6 +298,7 @@ class Correlation:
         self.follow_inclusions()
         if not s.adaptive_weight:
             return
+        fit.jitter_voxels = fit.bounded_jitter(fit.observed_jitter_voxels)
         for k in range(ADAPTATIONS):
             report_progress(self.progress, "weights of the penalties", done=k, total=ADAPTATIONS)
             samples = fit.samples(self.c, self.bending, self.dilatation * system.gauss_volume, ADAPTATION_SAMPLES, None, s.seed)
@@ -303,16 +307,18 @@ class Correlation:
             self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, iterations)
             if settled:
                 break
+        self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, POLISH)
 
     def reweigh(self, samples: Float32Array) -> bool:
         """Choose the weights of the penalties given random coefficients (n, 3, s), and return whether another round changes little."""
-        width, before = WEIGHT_WINDOW * float(self.step.mean()), self.dilatation
-        self.bending, dilatation = chosen_weights(self.fit, samples, self.c, self.bending, before, width, self.kinds)
+        width, before, bent = WEIGHT_WINDOW * float(self.step.mean()), self.dilatation, self.bending
+        self.bending, dilatation = chosen_weights(self.fit, samples, self.c, bent, before, width, self.kinds)
         if self.settings.dilatation_penalty:
             # never more than assumed: what little volume changes may not be noise alone
             self.dilatation = float(np.clip(dilatation, LEAST_WEIGHT * before, self.most_dilatation))
-        # a field that was penalised too much shows only in part how much volume changes
-        return self.dilatation > 0.5 * before
+        # a field that was penalised too much shows only in part how much volume changes, and one penalised too little has noise that bends
+        stiffer = float(np.median(self.bending[self.fit.system.inner] / bent[self.fit.system.inner]))
+        return self.dilatation > 0.5 * before and stiffer < MOST_STIFFER
 
     def depth_mm(self, level: ImageLevel) -> Float32Array:
         """Return the distance (n,) of the listed voxels of the finest level from the surface, mm; the ends of the volume are none."""
@@ -339,8 +345,8 @@ class Correlation:
             inclusion.draws.clear()
         noise = ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), lost_to_robustness(*fit.robust_sums))
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
-        found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content.matched)
-        return replace(found, blocks=block_displacements(self.volume, fit, noise, self.settings.seed + 2))
+        blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2)
+        return replace(collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content.matched), blocks=blocks)
 
 
 def require_overlap(seen: float) -> None:
@@ -430,21 +436,3 @@ def _labelled(rigid_mask: ArrayLike, volume: Volume) -> Int32Array:
     if given.dtype.kind not in "iu":
         raise InputError(f"rigid_mask must be boolean or hold labels of inclusions, not {given.dtype}")
     return given.astype(np.int32)
-
-
-def _kinds(fit: CorrelationFit, inclusions: list[RigidInclusion]) -> IntArray:
-    """Return 0 for soft cells, 1 for those next to an inclusion, 2 for those inside one: they differ too much to share a weight."""
-    system, level = fit.system, fit.level
-    if not inclusions:
-        return np.zeros(len(system.cells), np.int64)
-    rigid = np.zeros(len(level.intensity))
-    for inclusion in inclusions:
-        rigid[inclusion.voxels] = 1
-    where = (level.index.astype(np.int64) - level.low[::-1]).T
-    at = tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))
-    shape = tuple(int(n) for n in system.grid.cells[::-1])
-    flat = np.ravel_multi_index(at, shape)
-    count = np.bincount(flat, minlength=int(np.prod(shape)))
-    fraction = (np.bincount(flat, rigid, minlength=len(count)) / np.maximum(count, 1)).reshape(shape)
-    near = ndimage.binary_dilation(fraction > 0, np.ones((3, 3, 3), dtype=bool))
-    return np.asarray(np.where(fraction > 0.95, 2, np.where(near, 1, 0))[tuple(system.cells[:, 2:].T)], dtype=np.int64)

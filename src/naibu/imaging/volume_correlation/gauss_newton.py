@@ -6,7 +6,7 @@ Global correlation on a mesh :cite:p:`besnard2006,roux2008`, here with cubic B-s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -23,7 +23,7 @@ from naibu.imaging.volume_correlation.rigid_inclusions import RigidInclusion
 
 # relative accuracy of the linear solves: a Gauss-Newton step is repeated, a random field need not be more exact than it is random
 STEP_TOLERANCE, SAMPLE_TOLERANCE = 0.1, 0.06
-SAMPLES_AT_ONCE, FORCES_AT_ONCE = 16, 4  # right sides of one solve, and random forces on all voxels at once, which bound the memory
+SAMPLES_AT_ONCE = 16  # right sides of one solve, which bound the memory
 # empirical, fractions of the unknowns: at least so many count as determined by the data of a kind, and a cell's own weight starts from the
 # common one with the worth of so many
 LEAST_FRACTION, COMMON = 0.02, 0.05
@@ -54,6 +54,8 @@ class Iterations:
         texture in position while the volumes are far from registered.
     unsettled : float
         Fraction of the cells that have not converged, above which the steps go on, up to `MOST_STEPS`.
+    tolerance : float
+        Relative accuracy of the linear solves.
     """
 
     most: int = 6
@@ -61,6 +63,7 @@ class Iterations:
     limit_voxels: float = 2.0
     anchoring: float = 0.0
     unsettled: float = 1.0
+    tolerance: float = STEP_TOLERANCE
 
 
 class CorrelationFit(IntensityComparison):
@@ -125,7 +128,7 @@ class CorrelationFit(IntensityComparison):
                 first = self.displacement.copy() if first is None else first
                 self.anchor(first, times.anchoring)
             load = self.system.assembled(c, self.products, self.force, bending, dilatation)
-            step, _ = self.system.solved(load, STEP_TOLERANCE)
+            step, _ = self.system.solved(load, times.tolerance)
             length = np.linalg.norm(self.system.at_middles(step), axis=1)
             far = float(np.percentile(length, 95))
             shrink = min(1.0, times.limit_voxels * voxel / max(far, 1e-30))
@@ -186,21 +189,53 @@ class CorrelationFit(IntensityComparison):
         """
         out = np.empty((self.system.n, 3, count), np.float32)
         sensitivity = self.gradient * np.sqrt(self.weight)[:, None]
+        for inclusion in self.inclusions:
+            sensitivity[inclusion.voxels] = 0
         for first in range(0, count, SAMPLES_AT_ONCE):
             rng, many = np.random.default_rng((seed, first)), min(SAMPLES_AT_ONCE, count - first)
-            loads = np.empty((self.system.n, 3, many), np.float32)
-            for k in range(0, many, FORCES_AT_ONCE):
-                forces = np.empty((*sensitivity.shape, min(FORCES_AT_ONCE, many - k)), np.float32)
-                for j in range(forces.shape[2]):
-                    random = rng.standard_normal(len(sensitivity), dtype=np.float32) if noise is None else noise.draw(rng)
-                    force = sensitivity * random[:, None]
-                    for inclusion in self.inclusions:
-                        inclusion.perturb(force, random, rng)
-                    forces[:, :, j] = force
-                loads[:, :, k : k + FORCES_AT_ONCE] = self.system.force_loads(forces)
+            loads = self._random_loads(sensitivity, many, noise, rng)
             self.system.add_penalty_noise(loads, c, bending, dilatation, rng)
             out[:, :, first : first + SAMPLES_AT_ONCE] = self.system.solved_many(loads, SAMPLE_TOLERANCE)[0]
         return out
+
+    def _random_loads(self, sensitivity: Float32Array, count: int, noise: ResidualNoise | None, rng: np.random.Generator) -> Float32Array:
+        held: list[list[FloatArray]] = []
+
+        def residuals() -> Iterator[Float32Array]:
+            for _ in range(count):
+                random = rng.standard_normal(len(sensitivity), dtype=np.float32) if noise is None else noise.draw(rng)
+                held.append([inclusion.perturbed(random, rng) for inclusion in self.inclusions])
+                yield random
+
+        loads = self.system.random_loads(sensitivity, residuals())
+        return loads + self.inclusion_loads(held) if self.inclusions else loads
+
+    def inclusion_loads(self, forces: Sequence[Sequence[FloatArray]]) -> Float32Array:
+        """Return loads (n, 3, s) of forces (k, 3) on the voxels of every inclusion, for every sample."""
+        at = np.concatenate([inclusion.voxels for inclusion in self.inclusions])
+        listed = np.full(len(self.level.intensity), -1, np.int32)
+        listed[at] = np.arange(len(at))
+        number = np.full(self.level.mask.shape, -1, np.int32)
+        number[self.level.mask] = listed
+        return self.system.force_loads(np.stack([np.concatenate(each) for each in forces], axis=2).astype(np.float32), number)
+
+
+def cell_kinds(fit: CorrelationFit) -> IntArray:
+    """Return 0 for soft cells, 1 for those next to an inclusion, 2 for those inside one: they differ too much to share a weight."""
+    system, level = fit.system, fit.level
+    if not fit.inclusions:
+        return np.zeros(len(system.cells), np.int64)
+    rigid = np.zeros(len(level.intensity))
+    for inclusion in fit.inclusions:
+        rigid[inclusion.voxels] = 1
+    where = (level.index.astype(np.int64) - level.low[::-1]).T
+    at = tuple(system.cell_of[a][where[a]] for a in (2, 1, 0))
+    shape = tuple(int(n) for n in system.grid.cells[::-1])
+    flat = np.ravel_multi_index(at, shape)
+    count = np.bincount(flat, minlength=int(np.prod(shape)))
+    fraction = (np.bincount(flat, rigid, minlength=len(count)) / np.maximum(count, 1)).reshape(shape)
+    near = ndimage.binary_dilation(fraction > 0, np.ones((3, 3, 3), dtype=bool))
+    return np.asarray(np.where(fraction > 0.95, 2, np.where(near, 1, 0))[tuple(system.cells[:, 2:].T)], dtype=np.int64)
 
 
 def chosen_weights(

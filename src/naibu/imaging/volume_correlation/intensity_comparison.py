@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -10,7 +11,12 @@ from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array
 from naibu.imaging.volume_correlation._warp_kernels import OUTSIDE, weighted_residuals
 from naibu.imaging.volume_correlation.image_level import GainMap, ImageLevel
 
+# errors of a field extend over an edge, whose voxels therefore tell less than their residuals, taken for independent, would
+JITTER = 2.5  # empirical, of the observed sub-voxel jitter
 MAD = 1.4826  # standard deviation of a normal distribution, in median absolute deviations
+# quantiles of the gradient between classes of voxels, of which there are enough, and fewest voxels
+CLASSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0)
+ENOUGH, LEAST_SEEN = 200_000, 1200
 ROUNDING = 1e-6  # least residual SD, of the intensity range: identical volumes would divide by zero
 
 
@@ -56,6 +62,8 @@ class IntensityComparison:
         Which map intensities of the deformed volume to those of the reference.
     residual_sd : float
         Standard deviation of the residual, robust once the volumes are nearly registered.
+    jitter_voxels : float
+        Sub-voxel jitter SD, voxels: that of the settings, or a smaller one that the residuals tell.
     """
 
     def __init__(self, level: ImageLevel, settings: ComparisonSettings) -> None:
@@ -66,6 +74,7 @@ class IntensityComparison:
         self.products, self.agreement = np.zeros((n, 6), np.float32), np.zeros((n, 12), np.float32)
         self.gain, self.offset = np.ones(n, np.float32), np.zeros(n, np.float32)
         self.robust_weight, self.residual_sd = np.ones(n, np.float32), 0.0
+        self.jitter_voxels = settings.jitter_sd_voxels
 
     @property
     def seen(self) -> BoolArray:
@@ -86,7 +95,7 @@ class IntensityComparison:
         """Weight the residuals at the present displacement, gain and offset."""
         s = self.settings
         scalars = np.array(
-            [self.residual_sd**-2, (s.jitter_sd_voxels * self.level.spacing.mean()) ** 2, s.robust**-2, s.reference_fraction]
+            [self.residual_sd**-2, (self.jitter_voxels * self.level.spacing.mean()) ** 2, s.robust**-2, s.reference_fraction]
         )
         weighted_residuals(
             self.level.intensity, self.value, self.gain, self.offset, self.reference_gradient, self.gradient, scalars.astype(np.float32),
@@ -100,6 +109,26 @@ class IntensityComparison:
         # with q = sqrt(w / w at r = 0): the derivative of r q^2 is q^2 (4 q - 3)
         q = 1 / (1 + (self.residual.astype(float) / (self.settings.robust * self.residual_sd)) ** 2)
         return float(w.sum()), float((w * (4 * q - 3)).sum())
+
+    def bounded_jitter(self, observed_voxels: float) -> float:
+        """Return the sub-voxel jitter to weigh by, voxels, given the observed one: never more than the settings say."""
+        return min(self.settings.jitter_sd_voxels, JITTER * observed_voxels)
+
+    @property
+    def observed_jitter_voxels(self) -> float:
+        """Sub-voxel jitter SD, voxels: how residuals grow with the intensity gradient, by regression of their variance on its square."""
+        some = slice(None, None, max(1, len(self.value) // ENOUGH))
+        seen = self.seen[some]
+        steep, residual = (self.gradient[some][seen].astype(float) ** 2).sum(axis=1), np.abs(self.residual[some][seen])
+        if len(steep) < LEAST_SEEN:
+            return self.settings.jitter_sd_voxels / JITTER
+        order = np.argsort(steep, kind="stable")
+        parts = [order[int(a * len(order)) : int(b * len(order))] for a, b in pairwise(CLASSES)]
+        variance = np.array([max(MAD * float(np.median(residual[part])), ROUNDING) ** 2 for part in parts])
+        root = np.sqrt([len(part) for part in parts])
+        terms = np.stack([np.ones(len(parts)), [steep[part].mean() for part in parts]], axis=1) * (root / variance)[:, None]
+        jitter = float(np.linalg.lstsq(terms, root, rcond=None)[0][1])
+        return float(np.sqrt(max(jitter, 0.0)) / self.level.spacing.mean())
 
     @property
     def gradient_correlation(self) -> float:

@@ -5,10 +5,15 @@ Samples are drawn by perturbing data and penalties, and solving :cite:p:`papandr
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import islice
+
 import numpy as np
 
+from naibu._numba.simd import WIDTH
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
-from naibu.imaging.volume_correlation._spline_kernels import add_forces, add_noise, assemble, product, products_of_many, sample_energies
+from naibu.imaging.volume_correlation._sample_kernels import add_random_forces, products_of_many
+from naibu.imaging.volume_correlation._spline_kernels import add_forces, add_noise, assemble, product, sample_energies
 from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
@@ -171,9 +176,11 @@ class SplineSystem:
 
     def solved_many(self, loads: Float32Array, tolerance: float, most: int = 100) -> tuple[Float32Array, int]:
         """Return A^-1 loads (n, 3, s), all at once, and the number of iterations."""
-        n, single = self.n, loads.shape[2] == 1
-        x, r = np.zeros_like(loads), loads.copy()
-        p, ap = np.zeros((n + 1, *loads.shape[1:]), np.float32), np.empty_like(loads)
+        n, given = self.n, loads.shape[2]
+        single = given == 1
+        r = loads.copy() if single else np.pad(loads, ((0, 0), (0, 0), (0, -given % WIDTH)))
+        x = np.zeros_like(r)
+        p, ap = np.zeros((n + 1, *r.shape[1:]), np.float32), np.empty_like(r)
         z = self.inverse @ r
         p[:n] = z
         rz = first = _dot(r, z)
@@ -194,7 +201,7 @@ class SplineSystem:
             p[:n] *= (new / np.maximum(rz, 1e-30)).astype(np.float32)
             p[:n] += z
             rz = new
-        return x, steps
+        return np.ascontiguousarray(x[:, :, :given]), steps
 
     def bending_load(self, c: FloatArray, bending: FloatArray) -> Float32Array:
         """Return the loads (n, 3) of the bending penalty of weights (m, 3) at coefficients c."""
@@ -214,6 +221,23 @@ class SplineSystem:
         flat = forces.reshape(len(forces), 3 * forces.shape[2])  # also of no voxel
         add_forces(loads.reshape(self.n, -1), self.tasks, self.cells, self.slot, flat, which, self.starts, self.weights)
         return loads
+
+    def random_loads(self, sensitivity: Float32Array, random: Iterable[Float32Array], number: Int32Array | None = None) -> Float32Array:
+        """Return loads (n, 3, s) of the forces that random numbers (voxels,) times the sensitivity (voxels, 3) are, one load for each.
+
+        `number` is that of `force_loads`.
+        """
+        which = self.level.number if number is None else number
+        groups = [np.zeros((self.n, 3, 0), np.float32)]
+        numbers = np.zeros((len(sensitivity), WIDTH), np.float32)
+        left = iter(random)
+        while drawn := list(islice(left, WIDTH)):
+            for k, values in enumerate(drawn):
+                numbers[:, k] = values
+            loads = np.zeros((self.n, 3 * WIDTH), np.float32)
+            add_random_forces(loads, self.tasks, self.cells, self.slot, sensitivity, numbers, which, self.starts, self.weights)
+            groups.append(loads.reshape(self.n, 3, WIDTH)[:, :, : len(drawn)])
+        return np.concatenate(groups, axis=2)
 
     def add_penalty_noise(
         self, loads: Float32Array, c: FloatArray, bending: FloatArray, dilatation: FloatArray, rng: np.random.Generator

@@ -70,6 +70,12 @@ def amplitude_of(products: AnyFloatArray, pairs: AnyFloatArray) -> Float32Array:
 
 
 def coloured(amplitude: Float32Array, shape: Sequence[int], rng: np.random.Generator) -> Float32Array:
-    """Return a random periodic field of the given amplitudes."""
-    white = rng.standard_normal(tuple(shape), dtype=np.float32)
-    return np.asarray(fft.irfftn(fft.rfftn(white, workers=2) * amplitude, shape, workers=2), dtype=np.float32)
+    """Return a random periodic field (nz, ny, nx) of the given amplitudes (nz, ny, nx // 2 + 1), drawn frequency by frequency."""
+    spectrum = rng.standard_normal((*amplitude.shape, 2), dtype=np.float32).view(np.complex64)[..., 0]
+    spectrum *= amplitude
+    spectrum *= np.float32(np.sqrt(0.5 * np.prod(shape)))
+    # of two frequencies of opposite sign one is drawn; where both are in the array the transform takes their mean
+    spectrum[..., 0] *= np.float32(np.sqrt(2.0))
+    if shape[-1] % 2 == 0:
+        spectrum[..., -1] *= np.float32(np.sqrt(2.0))
+    return np.asarray(fft.irfftn(spectrum, shape, workers=2), dtype=np.float32)

@@ -183,14 +183,13 @@ class RigidInclusion:
             comparison.products[at, k] = self.weight
         comparison.force[at] = self.weight * (self.moved - self.points - comparison.displacement[at])
 
-    def perturb(self, force: Float32Array, random: Float32Array, rng: np.random.Generator) -> None:
-        """Replace random forces (n, 3) of its voxels by those of the motion that random residuals (n,) give."""
-        at = self.voxels
-        d = SYSTEMATIC * np.linalg.solve(self.information, self.derivatives.T @ (self.root_weight * random[at]))
+    def perturbed(self, random: Float32Array, rng: np.random.Generator) -> FloatArray:
+        """Return the random forces (k, 3) on its voxels of the motion that random residuals (n,) of all voxels give."""
+        d = SYSTEMATIC * np.linalg.solve(self.information, self.derivatives.T @ (self.root_weight * random[self.voxels]))
         self.draws.append(d)
         drawn = np.cross(d[:3], self.moved - self.centre - self.shift) + d[3:]
-        white = rng.standard_normal((len(at), 3)) / np.sqrt(self.weight)
-        force[at] = self.weight * (drawn + white)
+        white = rng.standard_normal((len(self.voxels), 3)) / np.sqrt(self.weight)
+        return np.asarray(self.weight * (drawn + white))
 
 
 def rigid_inclusions_among(

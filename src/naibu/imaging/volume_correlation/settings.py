@@ -54,7 +54,7 @@ class CorrelationSettings:
         Number of random fields from which the covariance is estimated, 8 or more; its relative error is about ``sqrt(2 / samples)``.
     jitter_sd_voxels : float
         Standard deviation of the sub-voxel jitter, voxels, 0 or more: the position error of a voxel's intensity, by which voxels of steep
-        intensity gradient get a lower weight.
+        intensity gradient get a lower weight; with `adaptive_weight` at most so much, and less where residuals hardly grow with gradients.
     smoothing_voxels : float
         Standard deviation of the Gaussian by which both volumes are smoothed, voxels of each resolution level, 0 or more.
     seed : int
