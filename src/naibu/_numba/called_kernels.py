@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-calls=False, warn-unused-ignores=False
-"""Kernels that are compiled because another kernel calls them: optimised code to link, without machine code and without wrappers.
+"""Kernels that are compiled because another kernel calls them: code to link, without machine code and without wrappers.
 
 Numba makes machine code and wrappers for callers in Python and in C of each kernel, though of a kernel that only other kernels call none is
 ever run: its code is linked into that of its callers. Where many small kernels are called by few large ones, that is a third of the time of
@@ -9,6 +9,7 @@ compilation. If Python calls such a kernel later, it is compiled again, with all
 from __future__ import annotations
 
 import contextlib
+import gc
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -31,7 +32,7 @@ class _NoPlaces:
 
 
 class CalledLibrary(JITCodeLibrary):
-    """Code of a called kernel: optimised and ready to be linked, never made into machine code."""
+    """Code of a called kernel: ready to be linked, never made into machine code."""
 
     codegen = _NoPlaces()  # type: ignore[assignment]
 
@@ -39,6 +40,9 @@ class CalledLibrary(JITCodeLibrary):
         """Take in code, but for a wrapper for Python, which Numba makes of the body of each parallel loop."""
         if ir_module.name != WRAPPER:
             super().add_ir_module(ir_module)
+
+    def _optimize_final_module(self) -> None:
+        """Leave the code to the optimisation of the kernel for Python: at each level of calls, all levels below were optimised again."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()
@@ -119,7 +123,7 @@ def compiled_for(called: bool, kernel: Any, compile: Compiler, args: Any, return
     compiler._customize_flags = _without_wrappers if called else _without_wrapper_for_c
     _Nesting.depth += 1
     try:
-        with libraries(CalledLibrary if called else _LibrariesOf(kernel)):
+        with libraries(CalledLibrary if called else _LibrariesOf(kernel)), _uncollected():
             result = compile(args, return_type)
     finally:
         _Nesting.depth -= 1
@@ -128,6 +132,18 @@ def compiled_for(called: bool, kernel: Any, compile: Compiler, args: Any, return
         for environment in result._find_referenced_environments():  # of the kernels that are linked into it
             kernel.targetctx.codegen().set_env(environment.env_name, environment)
     return result
+
+
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """Keep Python from looking for cycles among the many objects of a compilation, nearly all of which live until its end."""
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collecting:
+            gc.enable()
 
 
 def _without_wrappers(flags: Any) -> Any:
