@@ -200,3 +200,52 @@ def test_the_verb_tells_solids_from_surfaces(tmp_path: Path, verb: Callable[...,
 
 def test_tips_are_read_with_and_without_names(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_tip_path(path_file(tmp_path, text="# mm\nx,y,z\n1,2,3\n4,5,6\n")), [[1, 2, 3], [4, 5, 6]])
+
+
+def by_hand(folder: Path) -> list[Path]:
+    """One wavy sheet as others write it: Windows' line ends, quadrilaterals, normals, colours, names, vertices again for every facet."""
+    n, end = 8, "\r\n"
+    points = [(5.0 * x, 5.0 * y, np.sin(x)) for y in range(n + 1) for x in range(n + 1)]
+    quads = [(k := y * (n + 1) + x, k + 1, k + n + 2, k + n + 1) for y in range(n) for x in range(n)]
+    triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
+    rows = [" ".join(f"{v:.7f}" for v in p) for p in points]
+    wavefront = ["# by hand", "mtllib none.mtl", "o sheet", *[f"v {r} 1.0 0.5 0.5" for r in rows]]
+    wavefront += ["vt 0 0", "vn 0 0 1", "s off", "usemtl a b"]
+    for k, q in enumerate(quads):
+        wavefront.append("f " + " ".join(f"{i + 1}/1/1" if k % 2 else f"{i - len(points)}//-1" for i in q))
+    facets = ["solid my part 1"]
+    for t in triangles:
+        facets += ["facet normal 0.0 0.0 1.0E+00", " outer loop", *[f"  vertex {rows[i]}" for i in t], " endloop", "endfacet"]
+    ply = ["ply", "format ascii 1.0", "comment by hand", f"element vertex {len(points)}"]
+    ply += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")] + ["property uchar red", f"element face {len(quads)}"]
+    ply += ["property list uchar int vertex_index", "property uchar flag", "element edge 1", "property int vertex1", "property int vertex2"]
+    ply += ["end_header", *[f"{r} 0 0 1 10" for r in rows], *["4 " + " ".join(map(str, q)) + " 7" for q in quads], "0 1"]
+    vrml = ["#VRML V2.0 utf8", "DEF Scene Transform {", " translation 0 0 0", " children [ Shape {"]
+    vrml += [" geometry DEF G IndexedFaceSet {", "  solid FALSE creaseAngle 0.5 # scanner", "  coord Coordinate { point ["]
+    vrml += [*[f"  {r}," for r in rows], "  ] }", " normal Normal { vector [ 0 0 1 ] }", "  coordIndex ["]
+    vrml += [*["  " + " ".join(map(str, q)) + " -1" for q in quads], "  ] } } ] }"]
+    texts = {"sheet.obj": wavefront, "sheet.stl": [*facets, "endsolid my part 1"], "sheet.ply": ply, "sheet.wrl": vrml}
+    for name, lines in texts.items():
+        (folder / name).write_bytes((end.join(lines) + end).encode())
+    return [folder / name for name in texts]
+
+
+def test_surfaces_that_others_wrote_are_cut_alike(tmp_path: Path) -> None:
+    x = np.linspace(6.0, 34.0, 15)
+    z = np.interp(x, np.arange(0.0, 41.0, 5.0), np.sin(np.arange(9.0)))  # on the sheet
+    tip = path_file(tmp_path, text="x,y,z\r\n" + "".join(f"{a:.4f},20,{b:.4f}\r\n" for a, b in zip(x, z, strict=True)))
+    fine = np.linspace(6.0, 34.0, 20_001)
+    arc = float(np.hypot(np.diff(fine), np.diff(np.interp(fine, np.arange(0.0, 41.0, 5.0), np.sin(np.arange(9.0))))).sum())
+    found = [cut_surface_file(file, tip, out=tmp_path / file.suffix[1:]) for file in by_hand(tmp_path)]
+    for run in found:
+        assert run.cut.areas_mm2.sum() == pytest.approx(found[0].cut.areas_mm2.sum(), rel=1e-6)
+        assert run.numbers["largest_opening_mm"] == pytest.approx(found[0].numbers["largest_opening_mm"], rel=1e-3)
+        # at either end it may stop, or go on, within what is allowed
+        assert run.numbers["length_of_the_cut_mm"] == pytest.approx(arc, abs=2.0 * run.numbers["allowed_distance_mm"])
+    vrml = (tmp_path / "sheet.wrl").read_text()
+    (tmp_path / "moved.wrl").write_text(vrml.replace("translation 0 0 0", "translation 0 0 5"))
+    (tmp_path / "old.wrl").write_text(vrml.replace("V2.0 utf8", "V1.0 ascii"))
+    for name, said in (("moved", "apply transforms"), ("old", r"export the surface as VRML 2\.0")):
+        with pytest.raises(InputError, match=said):
+            cut_surface_file(tmp_path / f"{name}.wrl", tip, out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
