@@ -264,7 +264,7 @@ def test_sides_of_cuts_of_a_live_body_rub_where_friction_is_given(tmp_path: Path
         session.step(body.grip_velocity(np.zeros(3)), [])
     with pytest.raises(InputError, match="lips_friction must be a finite number"):
         live(path, lips_friction=-0.1, ready=print)
-    with pytest.raises(InputError, match="lips_friction must be 0, not 0.3"):
+    with pytest.raises(InputError, match=r"lips_friction must be 0, not 0\.3"):
         live("dough-pressed-by-sphere", port=0, lips_friction=0.3, ready=print)
 
 
