@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
-from naibu.cli.shell.console import INTERRUPTED, errors, print_table, progress_display, say
+from naibu.cli.shell.console import INTERRUPTED, WARNING, errors, print_table, progress_display, say
 from naibu.cli.shell.described import Flag, Out, Overwrite, Whole, WorkerOptions
 from naibu.cli.shell.run_record import wrote
 from naibu.cli.shell.verbs import REPRODUCE, SIMULATE, verb
@@ -145,6 +145,8 @@ def simulate(
         )  # fmt: skip
     wrote(*run.files)
     say(f"{time.perf_counter() - began:.0f} s. {', '.join(str(path) for path in run.files)}")
+    for warning in run.warnings:
+        say(warning, WARNING)
     if not run.finished:
         errors.print(f"Interrupted: {run.frames} of {run.of} {run.parts} are kept. The same command with --resume goes on.", soft_wrap=True)
         sys.exit(INTERRUPTED)

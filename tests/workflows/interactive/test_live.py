@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +20,8 @@ from touched_lattice import touched_lattice
 from naibu.core.errors import InputError
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing import box
-from naibu.simulation import InteractiveSimulation, RealTimeLoop
+from naibu.meshing.cutting.swept_blade import swept_blade
+from naibu.simulation import FiniteElementBody, InteractiveSimulation, RealTimeLoop
 from naibu.workflows import MeshMaterial, TouchableModel, live, tools_for, touchable
 from naibu.workflows.interactive.live import LiveSimulation
 
@@ -368,6 +371,23 @@ def test_what_cannot_be_touched_is_refused(tmp_path: Path) -> None:
     (tmp_path / "model.json").write_text("{}")
     with pytest.raises(InputError, match="not a naibu model"):
         touchable(tmp_path / "model.json")
+
+
+def test_sides_of_cuts_of_a_live_body_rub_where_friction_is_given(tmp_path: Path) -> None:
+    path = tmp_path / "block.vtu"
+    write_vtu(path, box((20.0, 20.0, 20.0), (3, 3, 3), cell_type="tetra"))
+    body = replace(touchable(path, material=MeshMaterial()).body, lips_friction=0.4)
+    assert isinstance(body, FiniteElementBody)
+    for x in (0.5, -6.0):  # the second cut keeps it too
+        edge = np.array([[x, -11.0, -11.0], [x, -11.0, 11.0]])
+        body, _, _ = body.cut(body.engine.rest(), swept_blade(np.stack([edge, edge + np.array([0.0, 12.0, 0.0])])))
+        assert body.engine.assembler.unsymmetric and body.engine.assembler.lips.friction == 0.4
+    with closing(body.session()) as session:
+        session.step(body.grip_velocity(np.zeros(3)), [])
+    with pytest.raises(InputError, match="lips_friction must be a finite number"):
+        live(path, lips_friction=-0.1, ready=print)
+    with pytest.raises(InputError, match=r"lips_friction must be 0, not 0\.3"):
+        live("dough-pressed-by-sphere", port=0, lips_friction=0.3, ready=print)
 
 
 def test_a_file_that_is_not_there_is_told_before_anything_is_prepared(tmp_path: Path) -> None:

@@ -59,6 +59,14 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def test_a_ball_smaller_than_the_faces_is_doubted_on_the_page_and_in_the_numbers(whole: Path, tmp_path: Path) -> None:
+    told = json.loads((whole / "out" / "mine.json").read_text())["warnings"]
+    assert len(told) == 1 and "radius of ball is 0.8 of the edge" in told[0]
+    assert told[0] in (whole / "out" / "mine.html").read_text()
+    larger = STUDY.replace("radius_mm = 8.0", "radius_mm = 10.0").replace("28.5", "30.5")
+    assert simulate_lattice(study_file(tmp_path, larger), tmp_path / "out").warnings == ()
+
+
 def test_forces_are_a_table_and_a_figure(whole: Path) -> None:
     files = tuple(whole / "out" / name for name in ("mine.html", "mine.vtkhdf", "mine.json"))
     run = workflow.SimulationRun(files, FRAMES, FRAMES)

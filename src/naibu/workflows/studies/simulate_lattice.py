@@ -17,6 +17,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.io.files.atomic import write_atomically
 from naibu.io.vtkhdf_series import SeriesFile
+from naibu.mechanics.lattices.model.contact_surface import RESOLVED, radius_over_face
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
 from naibu.viewer.cards import Card
@@ -49,12 +50,15 @@ class SimulationRun(ShownInNotebook):
         Number of frames kept after the first, and number asked for; of finite elements, number of studies or presses.
     parts : str
         What is counted.
+    warnings : tuple of str
+        What makes forces doubtful.
     """
 
     files: tuple[Path, ...]
     frames: int
     of: int
     parts: str = "frames"
+    warnings: tuple[str, ...] = ()
 
     @property
     def finished(self) -> bool:
@@ -196,7 +200,7 @@ def simulate_lattice(
     if stopped is not None and not isinstance(stopped, KeyboardInterrupt):
         kept = f"The first {state.frame * prepared.study.frame_s:g} s are kept in {series.target}."
         raise type(stopped)(f"{stopped} {kept}") from stopped
-    return SimulationRun(files, state.frame, prepared.study.frames)
+    return SimulationRun(files, state.frame, prepared.study.frames, warnings=_warnings(prepared))
 
 
 def _series(folder: Path, prepared: PreparedStudy, start: StudyState | None, checkpoint: Checkpoint) -> SeriesFile:
@@ -285,6 +289,7 @@ def _numbers(prepared: PreparedStudy, series: SeriesFile, state: StudyState) -> 
         "inputs_sha256": prepared.inputs,
         "fingerprint": prepared.fingerprint,
         "units": "mm, kg, s, mN, mN mm",
+        "warnings": list(_warnings(prepared)),
         "scanner_frame": {"direction": lattice.frame.rotation.tolist(), "origin_mm": lattice.frame.translation.tolist()},
         "nodes": study.lattice.n_nodes,
         "elements": study.lattice.n_elements,
@@ -353,7 +358,18 @@ def _sentences(prepared: PreparedStudy, state: StudyState, force: FloatArray) ->
     idle = [b.name for k, b in enumerate(study.bodies) if not np.abs(force[:, k]).any()]
     if idle and state.frame == study.frames:
         found.append(f"Never touched the object: {', '.join(idle)}.")
-    return found
+    return [*found, *_warnings(prepared)]
+
+
+def _warnings(prepared: PreparedStudy) -> tuple[str, ...]:
+    """Return which indenters are smaller than what the surface resolves."""
+    ratios = ((b.name, radius_over_face(prepared.study.lattice, b.indenter.geometry)) for b in prepared.study.bodies)
+    return tuple(
+        f"The radius of {name} is {ratio:.2g} of the edge of the faces, which do not resolve what it touches: its force may be wrong by 5 %"
+        " at 0.7 and by 10 % at 0.5 edges (3 % at 1); use smaller cubes, or an octree."
+        for name, ratio in ratios
+        if ratio < RESOLVED
+    )
 
 
 def _cards(prepared: PreparedStudy, force: FloatArray, moved: FloatArray) -> tuple[Card, ...]:

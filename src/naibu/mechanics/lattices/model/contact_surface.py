@@ -29,6 +29,7 @@ FLAT = 0.48  # thickness under flat indenters, whose contact comes and goes at o
 SINGLE = 0.15  # thickness where nodes touch for themselves: they stand on nothing that is coarser than themselves
 FLAT_ORDER = 2  # Gauss points per side of a face under a plane, exact for the product of two shape functions
 LEAST_ORDER, MOST_ORDER = 3, 8
+RESOLVED = 0.95  # radius of an indenter over the edge of a face from which forces are within 3 % of those of a mesh twice as fine
 FINENESS = 1.2  # quadrature points along the volume of an indenter over its area; 3.6 along the radius of a sphere
 
 
@@ -111,6 +112,15 @@ class ContactSurface:
         tension, spring, _, _ = explicit_coefficients(self.parameters)
         _, _, decay, growth = implicit_coefficients(self.parameters, step)
         return np.ascontiguousarray(np.stack([tension / step + spring * growth, spring * decay, decay, growth], axis=1))
+
+
+def radius_over_face(lattice: Lattice, geometry: IndenterGeometry) -> float:
+    """Return the radius of an indenter over the edge of the faces that it may touch; infinite where it is flat or nodes touch alone."""
+    faces = contact_faces(lattice)
+    if geometry.curvature == 0.0 or faces.shape[1] == 1:
+        return float("inf")
+    edges = np.linalg.norm(lattice.points[faces] - lattice.points[np.roll(faces, -1, axis=1)], axis=2)
+    return 1.0 / (geometry.curvature * float(np.median(edges)))
 
 
 def contact_faces(lattice: Lattice) -> IntArray:
