@@ -1,7 +1,8 @@
 """Runs the benchmarks one after the other, each in a process of its own, and tells what each took and which failed.
 
-Run: ``python benchmarks/all.py --quick`` (some five minutes on an idle computer) or ``python benchmarks/all.py`` (hours; writes the records
-that the documentation shows). ``--list`` only prints the commands. Their output goes to ``FOLDER/NAME.txt``, a temporary folder by default.
+Run: ``python benchmarks/all.py --quick`` (two to three minutes of processor time, kernels compiled) or ``python benchmarks/all.py`` (hours;
+writes the records that the documentation shows). ``--list`` only prints the commands. Their output goes to
+``FOLDER/NAME.txt``, a temporary folder by default.
 """
 
 from __future__ import annotations

@@ -115,7 +115,7 @@ def lattice(quick: bool, repeats: int) -> Rows:
     for n in (*VOXELS, *(() if quick else MORE_VOXELS)):
         body = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
         parameters = lattice_parameters(body, *(p * 8.0 / n for p in GENTLE))
-        steps = max(10, 200_000 // body.n_elements)
+        steps = max(20, 4_000_000 // body.n_elements)  # many: what a call costs besides, the conversion of the state, is shared by them
         c = explicit_coefficients(parameters)
         i, j = (np.ascontiguousarray(e) for e in body.elements.T)
         engine = LatticeEngine.of(body, parameters, step=STEP_S, method="euler", threads=1)
@@ -128,7 +128,7 @@ def lattice(quick: bool, repeats: int) -> Rows:
 
         loop()
         plain = least(loop, 3 * repeats) / steps
-        few = max(2, steps // 20)
+        few = max(2, steps // 200)
         own = least(lambda e=engine, s=start, k=constrained, v=velocity, n=steps: e.run(s, n, k, v), 3 * repeats) / steps  # type: ignore[misc]
         with_numpy = least(lambda b=body, c=c, n=few: numpy_steps(b, c, n), repeats) / few  # type: ignore[misc]
         for name, seconds in (("naibu", own), ("plain Numba loop", plain), ("NumPy", with_numpy)):

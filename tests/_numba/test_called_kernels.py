@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import subprocess
@@ -9,10 +10,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from numba.core.errors import TypingError
 
 import naibu
 from naibu._numba.cache_folder import VARIABLE
-from naibu._numba.compilation import called_apart
+from naibu._numba.compilation import called_apart, njit
 
 ELF = b"\x7fELF"  # begin of machine code in a file
 KERNELS = """
@@ -41,6 +43,8 @@ def roots(x, out):
         out[i] = root(x[i]) + sum_of_roots(x[:0])
 """
 ASK = """
+import gc
+
 import numpy as np
 from naibu._numba.reports import reported_compilation
 from naibu.kernels import root, roots, sum_of_roots
@@ -51,6 +55,7 @@ with reported_compilation(lambda kernel, done: compiled.append(kernel.rpartition
     out = np.zeros(2)
     roots(np.array([16.0, 25.0]), out)
     assert list(out) == [4.0, 5.0]
+    assert gc.isenabled()
     try:
         sum_of_roots(np.array([4.0, -9.0]))
     except ValueError as error:
@@ -105,3 +110,20 @@ def test_a_called_kernel_is_kept_without_machine_code(package: Path) -> None:
     whole = {path.name.split("-")[0]: ELF in path.read_bytes() for path in package.rglob("*.nbc")}
     assert not whole["naibu.kernels.root"]
     assert whole["naibu.kernels.roots__parallel"]
+
+
+@pytest.mark.skipif(not called_apart(), reason="all kernels are compiled whole with this version of Numba")
+@pytest.mark.parametrize("collecting", [True, False])
+def test_compilation_leaves_the_search_for_cycles_as_it_was(collecting: bool) -> None:
+    @njit(cache=True)
+    def fails(x):  # type: ignore[no-untyped-def]
+        return x + "text"
+
+    before = gc.isenabled()
+    try:
+        gc.enable() if collecting else gc.disable()
+        with pytest.raises(TypingError):
+            fails(1.0)
+        assert gc.isenabled() == collecting
+    finally:
+        gc.enable() if before else gc.disable()
