@@ -11,7 +11,7 @@ from .specimens.lattice_twin import Twin, dough_lattice, dough_parameters, dough
 from .specimens.marker_phantoms import Phantom, Scanner, VirtualSpecimen, box_experiment, phantom, two_gels, virtual_specimen
 from .specimens.quadratic_body import QuadraticBody
 from .specimens.scanned_leg import LegShape, ScannedLeg, scanned_leg
-from .specimens.scanned_liver import ScannedLiver, scanned_liver
+from .specimens.scanned_liver import Lump, ScannedLiver, scanned_liver
 from .specimens.specimen_matching import BlockMatch, block_match
 from .specimens.textured_sphere import ScannedBall, squeezed_ball
 
@@ -21,6 +21,7 @@ __all__ = [
     "FormulaMotion",
     "HomogeneousState",
     "LegShape",
+    "Lump",
     "MRDevice",
     "MarkerKind",
     "MatchedMotion",

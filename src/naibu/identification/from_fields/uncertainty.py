@@ -147,7 +147,7 @@ class ErrorBudget:
     ----------
     noise, mesh, known : ndarray, shape (2 k,)
         Standard deviations of ln mu, then ln(kappa / mu), from the measurement, from what extrapolation to vanishing element size leaves
-        in doubt, and from the stated uncertainty of known regions. NaN for the mesh where its error was not estimated.
+        in doubt, and from the stated uncertainty of known regions and of borders. NaN for the mesh where its error was not estimated.
     shared : float
         By how much errors that neighbours share raised the variance from the measurement, 1 or more.
     """
@@ -229,7 +229,7 @@ def _parts(budget: ErrorBudget, zone: int, count: int) -> str:
     noise, mesh, known = (100.0 * float(values[zone]) for values in (budget.noise, budget.mesh, budget.known))
     parts = [f"measurement {noise:.2g} %", f"elements {mesh:.2g} %" if np.isfinite(mesh) else "elements not estimated"]
     if known > 0.0:
-        parts.append(f"known values {known:.2g} %")
+        parts.append(f"known values and borders {known:.2g} %")
     shared = f" Errors that neighbours share raised the first {np.sqrt(budget.shared):.2g} times." if budget.shared > 1.0 else ""
     return f" Of its shear modulus: {', '.join(parts)}.{shared}"
 
