@@ -374,8 +374,7 @@ class _Recipe:
             relative = shift if corrected is not None else relative_change(shift)
             if corrected is None:
                 mixed, sure = self.region_at is not None, on_mesh.standard_deviations() < DETERMINED
-                of_zones = np.isin(model.zones.names, thin) if thin else None
-                of_mesh, covariance = doubt_of(relative, mixed=mixed, thin=of_zones, sure=sure)
+                of_mesh, covariance = doubt_of(relative, mixed=mixed, thin=np.isin(model.zones.names, thin) if thin else None, sure=sure)
             else:
                 of_mesh, covariance = corrected.doubt
             of_mesh, total = of_mesh * stretch, total.with_added(covariance * np.outer(stretch, stretch))

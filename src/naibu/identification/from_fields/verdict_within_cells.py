@@ -114,7 +114,7 @@ def limited_by_elements(judged: Verdict, names: Sequence[str], of_mesh: FloatArr
     factors = np.sqrt(bounds[rough, 1] / bounds[rough, 0])
     each = [
         f"that of {names[i]} " + (f"within a factor of {f:.2g}" if np.isfinite(f) else "not at all")
-        for i, f in zip(rough, factors, strict=True)
+        for i, f in zip(rough.tolist(), factors, strict=True)
     ]
     known = f"elements of this size tell Young's modulus only roughly, {' and '.join(each)}"
     return replace(judged, limits=known)

@@ -76,7 +76,8 @@ def _variance(mesh: Mesh, field: DisplacementField) -> FloatArray:
     touched = sp.csr_matrix(
         (np.ones(mesh.cells.size), (np.repeat(np.arange(mesh.n_cells), mesh.cells.shape[1]), mesh.cells.ravel())), (mesh.n_cells, n)
     )
-    near = ((touched @ touched.T) > 0).astype(float)
+    near = sp.csr_matrix(touched @ touched.T)
+    near.data[:] = 1.0
     squares, freedom, count = (near @ np.bincount(at.cells, v, mesh.n_cells) for v in (left, free, np.ones_like(free)))
     enough = freedom > np.maximum(FEWEST * count, 1.0)
     ratio = squares / np.maximum(freedom, 1.0)
