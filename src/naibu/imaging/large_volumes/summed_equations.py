@@ -143,7 +143,9 @@ class SummedEquations:
         if stage == "covariance" and model.products is not None and model.pairs is not None:
             tiles = NoiseTiles.for_blocks(edges, seed, model.products, model.pairs)
         lagged = stage == "step" and model.passes + 1 >= LEAST_PASSES
-        return FieldState(stage, model.coefficients, model.gain, model.residual_sd, model.jitter_voxels, dense, draws, lagged, tiles, seed + model.passes)
+        return FieldState(
+            stage, model.coefficients, model.gain, model.residual_sd, model.jitter_voxels, dense, draws, lagged, tiles, seed + model.passes
+        )
 
     @property
     def adapting(self) -> bool:
@@ -171,7 +173,8 @@ class SummedEquations:
         if self.adapting and passes == ADAPTED_PASS - 1:
             jitter = self.fit.bounded_jitter(float(np.sqrt(sums.jitter / sums.seen)))
         return replace(
-            self._with_intensities(sums), jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending, dilatation=coarse.dilatation, passes=passes,
+            self._with_intensities(sums), jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending,
+            dilatation=coarse.dilatation, passes=passes,
             settled=passes >= LEAST_PASSES and self.fit.moving_fraction <= UNSETTLED, products=sums.products, pairs=sums.pairs,
         )  # fmt: skip
 

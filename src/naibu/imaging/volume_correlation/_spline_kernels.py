@@ -281,13 +281,6 @@ def add_scaled(w: Any, x: AnyArray, y: AnyArray) -> None:
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def add_scaled(w: Any, x: AnyArray, y: AnyArray) -> None:
-    """Add w x to y (k,); loops around it have bounds that the compiler does not know, so that it is not unrolled many times."""
-    for k in range(len(x)):
-        y[k] += w * x[k]
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
 def _add_forces(
     forces: AnyArray, which: AnyArray, box: AnyArray, wx: AnyArray, wy: AnyArray, wz: AnyArray, f1: AnyArray, f2: AnyArray, load: AnyArray
 ) -> None:

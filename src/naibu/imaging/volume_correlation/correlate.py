@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
