@@ -9,7 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.simulation import Frame, HapticHand, InteractiveSimulation, SimulatedDevice
-from naibu.simulation.haptic_loop import DeviceForce
+from naibu.simulation.haptics.haptic_loop import DeviceForce
 from naibu.workflows.interactive.haptics.endpoint import LOOPBACK, DeviceDatagrams
 from naibu.workflows.interactive.haptics.packets import force_bytes, pose_bytes, read_force
 

@@ -8,18 +8,19 @@ from .adaptive.lattice import AdaptiveLattice, SpringMaterial
 from .adaptive.linear_dynamics import LinearDynamics
 from .adaptive.spring_levels import level_spring
 from .adaptive.statics import AdaptiveSolution, StaticResult, hyperelastic_static, linear_static, pressed_by, solve_adaptively
-from .force_limits import ForceLimits
-from .haptic_loop import DeviceChannel, DeviceForce, DevicePose, HapticHand
-from .haptic_thread import HapticThread
-from .interactive_bodies import FiniteElementBody, Frame, InteractiveBody, LatticeBody
+from .frame import Frame
+from .haptics.force_limits import ForceLimits
+from .haptics.haptic_loop import DeviceChannel, DeviceForce, DevicePose, HapticHand
+from .haptics.haptic_thread import HapticThread
+from .haptics.local_contact import LocalContact
+from .haptics.simulated_device import SimulatedDevice
+from .haptics.virtual_coupling import VirtualCoupling
+from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
 from .interactive_simulation import InteractiveSimulation
 from .lattice_cut import LatticeCut, cut_engine, cut_lattice, cut_session
-from .local_contact import LocalContact
 from .real_time_loop import RealTimeLoop
-from .simulated_device import SimulatedDevice
 from .surface_opening import opened, opening
 from .surface_springs import CutSprings, SurfaceSprings, surface_springs
-from .virtual_coupling import VirtualCoupling
 
 __all__ = [
     "AdaptiveBody",

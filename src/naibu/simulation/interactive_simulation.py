@@ -23,8 +23,9 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.simulation.background_cut import BackgroundCut
+from naibu.simulation.frame import Frame
 from naibu.simulation.held_tool import HeldTool, outside_planes
-from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, Frame, InteractiveBody
+from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
 from naibu.simulation.lattice_cut import LatticeCut
 from naibu.simulation.tool_places import farthest_in_a_step, placed, towards, waiting_place
 

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from naibu.core.errors import NaibuError
-from naibu.simulation.haptic_loop import HapticHand, require_haptic_steps
-from naibu.simulation.interactive_bodies import Frame
+from naibu.simulation.frame import Frame
+from naibu.simulation.haptics.haptic_loop import HapticHand, require_haptic_steps
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
 
 MEMORY_S = 1.0  # over which rates are averaged

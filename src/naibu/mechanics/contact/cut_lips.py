@@ -137,8 +137,15 @@ class CutLips:
         return float(energy), blocks
 
     def _rubbed(
-        self, gap: FloatArray, normal: FloatArray, relative: FloatArray, force: FloatArray, blocks: FloatArray, traction: FloatArray,
-        *, secant: bool = False,
+        self,
+        gap: FloatArray,
+        normal: FloatArray,
+        relative: FloatArray,
+        force: FloatArray,
+        blocks: FloatArray,
+        traction: FloatArray,
+        *,
+        secant: bool = False,
     ) -> float:
         """Add friction to internal forces and stiffnesses, put that of the pairs in place, and return what is stored in elastic slip."""
         anchors = self._relative(np.zeros_like(self.points)) if self.anchors is None else self.anchors

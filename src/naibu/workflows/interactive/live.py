@@ -16,11 +16,12 @@ from threadpoolctl import threadpool_limits
 
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.simulation.haptic_loop import LONGEST_STEP_S, HapticHand
-from naibu.simulation.haptic_thread import HapticThread
-from naibu.simulation.interactive_bodies import FiniteElementBody, Frame, InteractiveBody
+from naibu.simulation.frame import Frame
+from naibu.simulation.haptics.haptic_loop import LONGEST_STEP_S, HapticHand
+from naibu.simulation.haptics.haptic_thread import HapticThread
+from naibu.simulation.haptics.local_contact import LocalContact
+from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
-from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.simulation.tool_places import placed
 from naibu.viewer.live.commands import LiveCommand

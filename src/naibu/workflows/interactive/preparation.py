@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from naibu.simulation.haptic_loop import HapticHand
+from naibu.simulation.haptics.haptic_loop import HapticHand
 from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
 from naibu.workflows.interactive.touchable_models import tools_for

@@ -21,7 +21,8 @@ from naibu.applications.sensing_chip.filters import noise_gain, ramp_lag
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, cylindrical_indenter
-from naibu.simulation.interactive_bodies import FiniteElementBody, Frame
+from naibu.simulation.frame import Frame
+from naibu.simulation.interactive_bodies import FiniteElementBody
 from naibu.viewer.live.scene import LiveReading
 from naibu.workflows.applications.fingertip_study import FINGERTIP, prepared_fingertip
 from naibu.workflows.applications.stored_decoder import stored_detector

@@ -34,7 +34,8 @@ from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.point_location import interpolation_operator
-from naibu.simulation.interactive_bodies import FiniteElementBody, Frame, InteractiveBody, LatticeBody, nodes_touching
+from naibu.simulation.frame import Frame
+from naibu.simulation.interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody, nodes_touching
 from naibu.viewer.live.scene import LiveReading
 from naibu.workflows.joint_model import JointModel
 from naibu.workflows.markers.experiments import Source, load_experiment

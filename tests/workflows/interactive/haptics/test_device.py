@@ -16,7 +16,7 @@ from naibu.core.errors import InputError
 from naibu.mechanics import Assembler, elements, material
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, InteractiveSimulation, SimulatedDevice
-from naibu.simulation.haptic_loop import WAITS, DeviceForce, DevicePose
+from naibu.simulation.haptics.haptic_loop import WAITS, DeviceForce, DevicePose
 from naibu.workflows import TouchableModel, drive_live_simulation, live, tools_for, touched_loop
 from naibu.workflows.interactive.haptics.packets import pose_bytes, read_force
 

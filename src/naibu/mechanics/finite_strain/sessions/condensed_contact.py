@@ -90,7 +90,13 @@ class CondensedContact:
         return tangent is self.tangent and bool(np.isin(nodes, self.nodes, assume_unique=True).all())
 
     def forces(
-        self, free: FloatArray, law: ContactLaw, begin: FloatArray, tolerance_mm: float, longest_mm: float, faint_mn: float,
+        self,
+        free: FloatArray,
+        law: ContactLaw,
+        begin: FloatArray,
+        tolerance_mm: float,
+        longest_mm: float,
+        faint_mn: float,
         most: int = CHANGES,
     ) -> Generator[None, None, FloatArray]:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.

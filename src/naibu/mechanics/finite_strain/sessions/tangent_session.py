@@ -141,7 +141,12 @@ class TangentSession(DynamicSession):
         return self.bodies[0] if self.bodies else np.zeros(0, np.int64)
 
     def _made(
-        self, u: FloatArray, near: tuple[NearbyContact, ...], places: tuple[Int32Array, ...], held: IntArray, ahead: IntArray,
+        self,
+        u: FloatArray,
+        near: tuple[NearbyContact, ...],
+        places: tuple[Int32Array, ...],
+        held: IntArray,
+        ahead: IntArray,
         slipped: FloatArray | None,
     ) -> EarlierTangent:
         """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`.

@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from naibu.core.errors import InputError
-from naibu.simulation.haptic_loop import DeviceForce, DevicePose
+from naibu.simulation.haptics.haptic_loop import DeviceForce, DevicePose
 from naibu.workflows.interactive.haptics.packets import POSE, force_bytes, read_pose
 
 LOOPBACK = "127.0.0.1"

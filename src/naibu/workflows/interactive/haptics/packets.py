@@ -8,7 +8,7 @@ import struct
 import numpy as np
 
 from naibu.core.errors import InputError
-from naibu.simulation.haptic_loop import DeviceForce, DevicePose
+from naibu.simulation.haptics.haptic_loop import DeviceForce, DevicePose
 
 VERSION = 2
 POSE_MAGIC, FORCE_MAGIC = b"NHP1", b"NHF1"

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import FloatArray, as_vector, require_positive
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.simulation.interactive_bodies import Frame
+from naibu.simulation.frame import Frame
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
 from naibu.simulation.tool_places import placed
 

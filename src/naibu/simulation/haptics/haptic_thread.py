@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Self
 
-from naibu.simulation.haptic_loop import HapticHand
+from naibu.simulation.haptics.haptic_loop import HapticHand
+from naibu.simulation.haptics.local_contact import LocalContact
 from naibu.simulation.interactive_simulation import InteractiveSimulation
-from naibu.simulation.local_contact import LocalContact
 from naibu.simulation.real_time_loop import RealTimeLoop
 
 BEHIND_S = 0.02  # a delay that is not caught up with

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.simulation.haptic_loop import DeviceForce, DevicePose
+from naibu.simulation.haptics.haptic_loop import DeviceForce, DevicePose
 
 SILENCE_S = 0.02  # without an answer for so long, the device lets go
 

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.simulation.force_limits import ForceLimits, PassivityController, StepLimiter
+from naibu.simulation.haptics.force_limits import ForceLimits, PassivityController, StepLimiter
+from naibu.simulation.haptics.virtual_coupling import CoupledTool, VirtualCoupling
 from naibu.simulation.interactive_simulation import InteractiveSimulation
-from naibu.simulation.virtual_coupling import CoupledTool, VirtualCoupling
 
 LONGEST_STEP_S = 2e-3
 HOLDS = 1  # button that lets the device move without its tool

@@ -13,8 +13,8 @@ from naibu.core.arrays import FloatArray
 from naibu.mechanics import Assembler, elements, material, spherical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, Frame, HapticHand, InteractiveSimulation, LocalContact, SimulatedDevice
+from naibu.simulation.haptics.local_contact import LocalFrame, LocalReaction
 from naibu.simulation.interactive_simulation import FRAME_S, LEAST_TURN
-from naibu.simulation.local_contact import LocalFrame, LocalReaction
 
 STEP_S = 1e-3
 RADIUS, EDGE = 8.0, 40.0

@@ -9,7 +9,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.simulation import ForceLimits
-from naibu.simulation.force_limits import PassivityController, StepLimiter
+from naibu.simulation.haptics.force_limits import PassivityController, StepLimiter
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.01, 0.5])

@@ -7,7 +7,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.simulation import VirtualCoupling
-from naibu.simulation.virtual_coupling import LEAST_CHANGE, CoupledTool
+from naibu.simulation.haptics.virtual_coupling import LEAST_CHANGE, CoupledTool
 
 STEP = 1e-3
 

@@ -1,0 +1,66 @@
+"""What is shown of an interactive simulation at one instant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from naibu.core.arrays import FloatArray
+from naibu.simulation.interactive_bodies import InteractiveBody
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """What a frame shows.
+
+    Attributes
+    ----------
+    body : InteractiveBody
+        The body, whose nodes the positions are those of.
+    number : int
+        Frames since the beginning.
+    time_s : float
+        Simulated time, s.
+    positions : ndarray, shape (n, 3)
+        Nodes, mm.
+    tool : str
+        Name of the tool in play, or an empty string.
+    tool_centre : ndarray, shape (3,)
+        Its position, mm.
+    tool_rotation : ndarray, shape (3, 3)
+        Its rotation since it was made.
+    force : ndarray, shape (3,)
+        Mean force of the tool on the body during the frame, mN.
+    pull : ndarray, shape (3,)
+        Mean force of the grip on the body, mN.
+    penetration_mm : float
+        How deep the surface nodes lie in the tool at most.
+    gripped : int
+        Node that is gripped, or -1.
+    failed : str
+        Why the last step was taken back; empty where none was.
+    topology : int
+        Counts the cuts, undone ones included.
+    unbalanced : float
+        Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
+    under_way : bool
+        Whether a step takes longer than a frame: all is as before it but the number, and `unbalanced`, which is how far it has come.
+    held : bool
+        Whether crushed cells held the tool back; see `naibu.simulation.held_tool`.
+    """
+
+    body: InteractiveBody
+    number: int
+    time_s: float
+    positions: FloatArray
+    tool: str
+    tool_centre: FloatArray
+    tool_rotation: FloatArray
+    force: FloatArray
+    pull: FloatArray
+    penetration_mm: float
+    gripped: int = -1
+    failed: str = ""
+    topology: int = 0
+    unbalanced: float = 0.0
+    under_way: bool = False
+    held: bool = False
