@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 
 from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import ConvergenceError
+from naibu.identification.from_fields import mesh_error
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
@@ -120,6 +123,21 @@ def test_finite_strain_begins_though_little_is_measured_near_corners() -> None:
     found = measured(law="neo_hookean")
     assert found.status.ok and found.young_modulus[0] == pytest.approx(5.0, rel=0.1)
     assert any("small strain" in line for line in found.identifiability)
+
+
+def test_what_half_the_size_changes_at_small_strain_is_said_to_be_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Small cells are inverted by a rough displacement of the surface, and the change of small strain was taken without a word."""
+    of_law = mesh_error._changes
+
+    def inverted(at: Any, law: str, *more: Any) -> list[np.ndarray]:
+        if law != "linear":
+            raise ConvergenceError("a cell is inverted")
+        return of_law(at, law, *more)
+
+    assert not any("taken from small strain" in step for step in measured(law="neo_hookean").steps)
+    monkeypatch.setattr(mesh_error, "_changes", inverted)
+    found = measured(law="neo_hookean")
+    assert any("taken from small strain" in step for step in found.steps) and found.mesh_shift is not None
 
 
 def test_points_that_hold_the_misfit_are_named() -> None:

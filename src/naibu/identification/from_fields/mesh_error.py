@@ -149,8 +149,8 @@ def refitted(
     return Refit(step, left, tuple(u.reshape(state.shape) for u, state in zip(moved, at.point.states, strict=True)))
 
 
-def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> list[FloatArray] | None:
-    """Return by how much the whitened residuals (q,) of every load case change on a mesh of half the element size.
+def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> tuple[list[FloatArray], LawName] | None:
+    """Return by how much the whitened residuals (q,) of every load case change on a mesh of half the element size, and under which law.
 
     `moduli_on` gives the moduli of its cells, which are not those of the coarse ones where borders run through these.
     Where no equilibrium at finite strain is found on it, because the displacement of the loaded nodes is too rough for small cells, the
@@ -162,7 +162,7 @@ def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> 
     names: tuple[LawName, ...] = ("linear",) if law == "linear" else (law, "linear")
     for name in names:
         try:
-            return _changes(at, name, at.point.states if name == law else _small_strain(at), moduli_on)
+            return _changes(at, name, at.point.states if name == law else _small_strain(at), moduli_on), name
         except ConvergenceError:
             continue
     return None

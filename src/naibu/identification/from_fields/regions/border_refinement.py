@@ -217,9 +217,10 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     residuals, converged, before, least = tuple[FloatArray, ...](), False, here, np.inf
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
-        changes = changes_on_finer_mesh(at, law, now.moduli_on)
-        if changes is None:
+        finer = changes_on_finer_mesh(at, law, now.moduli_on)
+        if finer is None:
             return None
+        changes, _ = finer
         left = sum(float(np.sum((o.residual(u) + c) ** 2)) for o, u, c in zip(model.observed, at.point.states, changes, strict=True))
         if left > least:  # surfaces that follow precise data move differently among smaller cells: no more can be said
             here = before
