@@ -17,10 +17,10 @@ from naibu.cli import main
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.estimate import NO_REGIONS, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.uncertainty import Uncertainty
-from naibu.io.displacement_fields import write_field
+from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
 from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced, moved_borders, sizes_of_voxels
@@ -278,3 +278,15 @@ def test_a_map_without_a_known_zone_is_relative_to_its_largest_region(folder: Pa
             assert middle < 20.0 and young[zone][0] < 0.5 < young[zone][1] < 1.0
     assert run.relative and run.unit == "multiples of the largest region" and "kPa" not in " ".join(run.notes)
     assert "largest region" in (folder / "map" / "report.html").read_text() and (folder / "map" / "model.json").exists()
+
+
+def test_a_map_that_no_regions_explain_says_so_first(folder: Path) -> None:
+    """Noise is stated as a fifth of what it is: what regions leave is beyond it, and the map under the penalty has no intervals."""
+    field = read_field(folder / "field.h5")
+    write_field(folder / "sure.h5", DisplacementField.from_arrays(field.points, field.vectors, sd_mm=0.2 * SD_MM))
+    run = identify_fields(folder / "sure.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=10.0)
+    assert run.estimate.uncertainty is None and run.notes[0] == NO_REGIONS
+    assert run.unit == "multiples of the median" and "multiples of the median" in run.notes[1]
+    volume = np.ones(run.estimate.zones.count)
+    above = (run.estimate.young_modulus > 1.0) @ volume / volume.sum()
+    assert 0.4 < above < 0.6

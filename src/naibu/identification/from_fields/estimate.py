@@ -74,6 +74,7 @@ from naibu.identification.verdict import Explanation
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
+NO_REGIONS = "No few regions of one material each explain the measurement: the result is a map under a penalty, without intervals."
 TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones."
 ONE_CELL_THICK = "One element thick in a large part: {}. Moduli may be wrong by a third, theirs several times: see intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
@@ -280,7 +281,8 @@ class _Recipe:
         )
         if misfit > limit:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
-            return replace(field, segmentation=regions, steps=tuple(self.steps))
+            words = (NO_REGIONS, *field.identifiability)
+            return replace(field, segmentation=regions, steps=tuple(self.steps), identifiability=words)
         sharp = self._with_borders(regions, graph)
         return replace(
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,

@@ -112,7 +112,8 @@ def _relative(found: FieldEstimate) -> FieldEstimate:
         unit = float(logarithm[order][np.searchsorted(np.cumsum(volume[order]), 0.5 * volume.sum())])
         theta = _divided(found.theta, unit)
         poisson = young_and_poisson(theta)[1]
-        return replace(found, theta=theta, regularized=(np.exp(logarithm - unit), poisson))
+        words = (*found.identifiability[:1], "Moduli are multiples of the median of the map.", *found.identifiability[1:])
+        return replace(found, theta=theta, regularized=(np.exp(logarithm - unit), poisson), identifiability=words)
     zone = int(np.argmax(volume))
     unit = float(logarithm[zone])
     theta, uncertainty = _divided(found.theta, unit), relative_to(found.uncertainty, found.theta, zone)
