@@ -8,7 +8,7 @@ from .from_fields.field_estimate import FieldEstimate
 from .from_fields.forward.load_cases import FieldLoadCase, KnownRegion, Zones
 from .from_fields.identified.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
 from .from_fields.identified.identified_body import IdentifiedBody
-from .from_fields.relative_map import identify_relative_map
+from .from_fields.regions.relative_map import identify_relative_map
 from .from_fields.uncertainty import ErrorBudget, cramer_rao_bound
 from .from_markers.calibration import Calibration, calibrate
 from .from_markers.gauss_newton import MatchingSettings

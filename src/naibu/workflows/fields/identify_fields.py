@@ -26,7 +26,7 @@ from naibu.identification.from_fields.forward.representation_error import with_r
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
-from naibu.identification.from_fields.relative_map import identify_relative_map
+from naibu.identification.from_fields.regions.relative_map import identify_relative_map
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
@@ -215,14 +215,12 @@ def identify_fields(
     cases = [case for case, _ in coarser]
     within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
     bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])
-    if stated.values:
-        sought_zones = Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative)
-        found = identify_field(
-            mesh, cases, sought_zones, law=law, bounds=bounds, region_at=within, borders=moved_borders(mesh, inside, labels),
-            progress=progress,
-        )  # fmt: skip
-    else:
+    if stated is NOTHING_KNOWN:
         found = identify_relative_map(mesh, cases, law=law, bounds=bounds, progress=progress)
+    else:
+        given = Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative)
+        borders = moved_borders(mesh, inside, labels)
+        found = identify_field(mesh, cases, given, law=law, bounds=bounds, region_at=within, borders=borders, progress=progress)
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
         found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
