@@ -262,20 +262,22 @@ def test_files_that_do_not_belong_together_are_told(folder: Path) -> None:
 
 
 def test_a_map_without_a_known_zone_is_relative_to_its_largest_region(folder: Path) -> None:
-    """A gel of 5 kPa under one of 10 kPa: multiples of the latter, 1/2 in all that lies below."""
+    """A gel of 5 kPa under one of 10 kPa: 2 is found for what is above, or 1/2 for what is below."""
     run = identify_fields(
-        folder / "field.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=6.7, out=folder / "map"
+        folder / "field.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=10.0, out=folder / "map"
     )
     found = run.estimate
     count, zones = np.bincount(found.zones.of_cell), found.zones
     assert 2 <= zones.count <= 4 and not zones.known and len(count) == zones.count and zones.of_cell.min() == 0
     height = run.body.mesh.points[found.mesh.cells].mean(axis=1)[:, 2] - found.mesh.points[:, 2].min()
     young, _ = found.intervals()
-    for zone, middle in enumerate(np.bincount(zones.of_cell, height) / count):
-        if zone == int(np.argmax(count)):
-            assert middle > 20.0 and found.young_modulus[zone] == pytest.approx(1.0) and young[zone] == pytest.approx([1.0, 1.0])
-        else:
-            assert middle < 20.0 and young[zone][0] < 0.5 < young[zone][1] < 1.0
+    below = np.bincount(zones.of_cell, height) / count < 20.0
+    largest = int(np.argmin(np.ptp(young, axis=1)))  # the halves are equal but for where their border is found
+    assert found.young_modulus[largest] == pytest.approx(1.0) and young[largest] == pytest.approx([1.0, 1.0])
+    truth = np.where(below, 5.0, 10.0) / (5.0 if below[largest] else 10.0)
+    assert below.any() and not below.all() and ((young[:, 0] <= truth + 1e-9) & (truth <= young[:, 1] + 1e-9)).all()
+    other = below != below[largest]
+    assert not ((young[other, 0] <= 1.0) & (young[other, 1] >= 1.0)).any()
     assert run.relative and run.unit == "multiples of the largest region" and "kPa" not in " ".join(run.notes)
     assert "largest region" in (folder / "map" / "report.html").read_text() and (folder / "map" / "model.json").exists()
 
@@ -290,3 +292,14 @@ def test_a_map_that_no_regions_explain_says_so_first(folder: Path) -> None:
     volume = np.ones(run.estimate.zones.count)
     above = (run.estimate.young_modulus > 1.0) @ volume / volume.sum()
     assert 0.4 < above < 0.6
+
+
+@pytest.mark.parametrize(
+    ("known", "each_cell", "told"), [(["body=10 kPa"], True, "leave one out; without it a map"), (["body"], False, "leave one out$")]
+)
+def test_what_leaves_nothing_to_be_identified_is_refused_and_leaves_no_folder(
+    folder: Path, known: list[str], each_cell: bool, told: str
+) -> None:
+    with pytest.raises(InputError, match=told):
+        identify_fields(folder / "field.h5", mask=folder / "labels.mha", known=known, each_cell=each_cell, out=folder / "nothing")
+    assert not (folder / "nothing").exists()

@@ -51,7 +51,7 @@ from naibu.workflows.fields.block_mesh import (
     sizes_of_voxels,
 )
 from naibu.workflows.fields.border_fitting import fitted_to_borders
-from naibu.workflows.fields.known_zones import NOTHING_KNOWN, parse_known_zones
+from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
 from naibu.workflows.fields.measured_load_case import doubts_of_field, measured_load_case, relative_deformation
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
@@ -194,12 +194,11 @@ def identify_fields(
         The fields do not fix how the surface moves, or there is no equilibrium.
     """
     paths = [fields] if isinstance(fields, str | os.PathLike) else list(fields)
-    folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     read = [read_field(path, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing) for path in paths]
     _require_different(paths, read)
     inside, labels = labelled_object(mask, zones)
     names = names_of_labels(labels, inside, zone_names or {})
-    stated = parse_known_zones(known, list(names.values())) if known or not each_cell else NOTHING_KNOWN
+    stated = _stated(known, list(names.values()), each_cell=each_cell)
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
     most = CELLS_OF_MAP if each_cell else min(CELLS, max(int(field.valid.sum()) for field in read) // POINTS_OF_CELL)
@@ -214,6 +213,7 @@ def identify_fields(
     coarser = [(case, 0.0) if each_cell else with_representation_error(mesh, case) for case in cases]
     cases = [case for case, _ in coarser]
     within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
+    folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])
     if stated is NOTHING_KNOWN:
         found = identify_relative_map(mesh, cases, law=law, bounds=bounds, progress=progress)
@@ -233,6 +233,23 @@ def identify_fields(
     notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
     result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
+
+
+def _stated(known: Sequence[str], names: Sequence[str], *, each_cell: bool) -> KnownZones:
+    """Return what is known of zones, of which a map needs nothing.
+
+    Raises
+    ------
+    InputError
+        What `parse_known_zones` refuses, or nothing that is not known.
+    """
+    if each_cell and not known:
+        return NOTHING_KNOWN
+    stated = parse_known_zones(known, names)
+    if set(names) <= set(stated.values):
+        ways = "; without it a map is made of multiples of the modulus of its largest region" if each_cell else ""
+        raise InputError(f"known names every zone, so that nothing is left to be identified: leave one out{ways}")
+    return stated
 
 
 def _bounds(known_kpa: Sequence[float]) -> Bounds:
