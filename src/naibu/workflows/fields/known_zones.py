@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from naibu.core.errors import InputError
 from naibu.core.units import kilopascals
+from naibu.identification.from_fields.forward.load_cases import POISSON_RATIO, POISSON_RATIO_SD
 
-POISSON_RATIO, POISSON_RATIO_SD = 0.45, 0.03  # of a known material of which only Young's modulus is stated
 RIGID = (
     3e4  # stiffness of what is called rigid over that of the stiffest other known material: with 300 a slender bone bends by a millimetre
 )

@@ -15,6 +15,7 @@ from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 KNOWN = -1
+POISSON_RATIO, POISSON_RATIO_SD = 0.45, 0.03  # of a known material of which only Young's modulus is stated
 
 
 @dataclass(frozen=True, slots=True, eq=False)

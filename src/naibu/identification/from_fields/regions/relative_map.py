@@ -19,15 +19,20 @@ from naibu.identification.from_fields.assumptions import Assumption, effects
 from naibu.identification.from_fields.estimate import TOO_COARSE, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
-from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, KnownRegion, Zones
+from naibu.identification.from_fields.forward.load_cases import (
+    KNOWN,
+    POISSON_RATIO,
+    POISSON_RATIO_SD,
+    FieldLoadCase,
+    KnownRegion,
+    Zones,
+)
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.regularization import cell_volumes, inner_faces
 from naibu.identification.from_fields.uncertainty import Uncertainty, intervals, report, young_and_poisson_slopes
 from naibu.identification.verdict import Explanation
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
-
-POISSON_RATIO, POISSON_RATIO_SD = 0.45, 0.03  # of the one cell that is taken as known
 
 
 def identify_relative_map(
