@@ -8,7 +8,6 @@ import os
 import pickle
 import re
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,12 +98,6 @@ def unpacked(target: Any, data: bytes) -> Any:
     """Return a compiled kernel from its bytes."""
     target.refresh()
     return CompileResult._rebuild(target, *pickle.loads(data))  # type: ignore[no-untyped-call]
-
-
-def kept_kernels() -> Iterator[Path]:
-    """Give the files of all compiled kernels that this installation can load, whatever sources they were made from."""
-    for folder in readable_folders():
-        yield from folder.glob(f"*{SUFFIX}")
 
 
 def _mark(path: Path) -> None:

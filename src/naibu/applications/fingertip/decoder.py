@@ -11,7 +11,7 @@ drags sideways, direction and place are wrong; `naibu.applications.fingertip.sli
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,7 +32,7 @@ from naibu.applications.fingertip._decoder_kernels import (
 from naibu.applications.fingertip.fingertip import Fingertip
 from naibu.applications.fingertip.pressing import Press, Pressing
 from naibu.applications.fingertip.readings import ReadingChain
-from naibu.core.arrays import BoolArray, FloatArray, as_points, as_vector, require_count, require_within
+from naibu.core.arrays import BoolArray, FloatArray, as_points, require_count, require_within
 from naibu.core.errors import InputError
 
 NORMAL_95 = 1.96
@@ -218,10 +218,6 @@ class ForceDecoder:
         noise = noise_share * self.noise[:2]
         decode_readings(loads, self.coefficients, self.unit, self.spread, noise, self.model_error, self.limits, out)
         return out
-
-    def with_noise(self, noise: ArrayLike) -> ForceDecoder:
-        """Return the decoder for readings with another standard deviation (3,), mN and mN mm."""
-        return replace(self, noise=as_vector("noise", noise))
 
 
 def train_decoder(fingertip: Fingertip, chain: ReadingChain, training: Training, pressings: Sequence[Pressing]) -> ForceDecoder:

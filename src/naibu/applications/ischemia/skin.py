@@ -6,7 +6,7 @@ Layers of three-element material (a Voigt solid in series with a dashpot) lie on
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -110,10 +110,6 @@ class SkinPatch:
     def height_mm(self) -> float:
         """Height of all layers, mm."""
         return sum(layer.thickness_mm for layer in self.layers)
-
-    def with_materials(self, *materials: Rheology) -> SkinPatch:
-        """Return the same patch of other materials, from the base upwards."""
-        return replace(self, layers=tuple(replace(la, material=m) for la, m in zip(self.layers, materials, strict=True)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -32,10 +32,6 @@ class Placement:
         """Return positions (n, 3) in the object's frame, mm, of printed coordinates."""
         return self.pose.inverse().applied(printed * self.scale)
 
-    def to_scan(self, points: FloatArray) -> FloatArray:
-        """Return printed coordinates (n, 3) of positions in the object's frame."""
-        return np.asarray(self.pose.applied(points) / self.scale)
-
 
 def placement(experiment: Experiment) -> Placement:
     """Find the pose of the object in the scan of its reference configuration.
