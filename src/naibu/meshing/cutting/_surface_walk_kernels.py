@@ -8,13 +8,15 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
-from naibu.meshing.cutting._surface_kernels import bisect, corner, fan, on_boundary, separate, size2, swap
-from naibu.meshing.cutting._surface_search_kernels import along, dot, from_to, nearest, nearest_on_triangle, on_path
+from naibu.meshing.cutting._surface_kernels import bisect, corner, divide, fan, has_room, on_boundary, on_rim, separate, size2, swap
+from naibu.meshing.cutting._surface_search_kernels import along, dot, first_at, from_to, nearest, nearest_on_triangle, on_path
 
 WAITING, STEPPED, LEFT, ENDED, STUCK, FULL = 0, 1, 2, 3, 4, 5
 NO_ROOM = -2
+BESIDE, INSIDE, RIM = 0, 1, 2  # values of `ToolArrays.over`
 FINEST = 4  # times that the allowed edge is halved where no edge leads on
-ONWARD, HARDLY = 0.1, 1e-3  # of an edge: how much further along the path it leads, and among flat triangles that bisection keeps flat
+ONWARD, HARDLY = 0.1, 1e-3  # of an edge: how much further along the path it leads, and where an edge is divided for want of one
+BLUNT = 0.1  # of an edge: its parts are not shorter, where the way through it allows that
 
 # entries of `ToolArrays.whole`: lengths of the path and of the list of cut edges, where the cut is, and how far a movement has come
 COUNT, EDGES, NOW, AT_BOUNDARY, BEGAN, LEFT_BEFORE, FREE, PIECE, PIECES, SAMPLED = range(10)
@@ -30,7 +32,7 @@ class ToolArrays(NamedTuple):
     length: FloatArray  # (p,) of the path so far, mm
     tips: FloatArray  # (p, 3) mm
     triangle: IntArray  # (p,) beneath
-    over: IntArray  # (p,) 1 over the surface, 2 on its boundary, 0 beside
+    over: IntArray  # (p,) BESIDE the surface, INSIDE its boundary, or over its RIM
     edges: IntArray  # (k, 2) that were cut, over all paths
     queue: IntArray
     around: IntArray
@@ -59,10 +61,9 @@ def _fits(s, k, r, c, size, least):  # type: ignore[no-untyped-def]  # pragma: n
     p, m, at, distance = s.position, k.whole[COUNT], k.real[AT], k.real[DISTANCE]
     high = at + 3.0 * max(size, distance)
     gap, reached = on_path(k.points, k.length, m, p[c, 0], p[c, 1], p[c, 2], at, high)
-    if k.length[m - 1] - at < distance:
-        if _from_end2(s, k, c) >= _from_end2(s, k, r):
-            return -1.0
-    elif reached <= at + least * size:
+    nearer = k.length[m - 1] - at < distance and _from_end2(s, k, c) < _from_end2(s, k, r)
+    inside = k.length[m - 1] - at < distance and k.over[m - 1] == INSIDE  # the end of the path is where the cut is to end
+    if not nearer and (inside or reached <= at + least * size):
         return -1.0
     if k.whole[FREE]:
         return reached
@@ -77,6 +78,18 @@ def _fits(s, k, r, c, size, least):  # type: ignore[no-untyped-def]  # pragma: n
 
 
 @njit(cache=True)
+def _leaves(k, at):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether the path leaves the surface within one distance ahead of a length of it, as far as it is known."""
+    m = k.whole[COUNT]
+    j = first_at(k.length, m, at)
+    while j < m and k.length[j] <= at + k.real[DISTANCE]:
+        if k.over[j] != INSIDE:
+            return True
+        j += 1
+    return False
+
+
+@njit(cache=True)
 def _from_end2(s, k, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     last = k.whole[COUNT] - 1
     x, y, z = s.position[v, 0] - k.points[last, 0], s.position[v, 1] - k.points[last, 1], s.position[v, 2] - k.points[last, 2]
@@ -84,8 +97,11 @@ def _from_end2(s, k, v):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def _best(s, k, r, across, least):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Vertex whose edge lies closest to the direction of the path, -1 if none, its triangle, corner and kind, and the length beside it."""
+def _best(s, k, r, across, rim):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Vertex whose edge lies closest to the direction of the path, -1 if none, its triangle, corner and kind, and the length beside it.
+
+    On the boundary of the surface only where the path leaves it there, or if `rim`.
+    """
     count, _ = fan(s, r, k.around)
     best, reached, found, beside, which, how = 0.0, -1.0, -1, -1, 0, 0
     p, at, m = s.position, k.real[AT], k.whole[COUNT]
@@ -106,27 +122,69 @@ def _best(s, k, r, across, least):  # type: ignore[no-untyped-def]  # pragma: no
             x, y, z = from_to(p, r, c)
             size = np.sqrt(dot(x, y, z, x, y, z))
             ax, ay, az = along(k.points, k.length, m, at + max(size, 0.5 * k.real[DISTANCE]))
-            if least < ONWARD:  # along the path, not back towards it
-                bx, by, bz = along(k.points, k.length, m, at)
-                ax, ay, az = ax - bx, ay - by, az - bz
-            else:
-                ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
+            ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
             cosine = dot(x, y, z, ax, ay, az) / max(size * np.sqrt(dot(ax, ay, az, ax, ay, az)), 1e-300)
             if cosine > best + (1e-9 if kind == 2 else 0.0):
-                behind = _fits(s, k, r, c, size, least)
-                if behind >= 0.0:
+                behind = _fits(s, k, r, c, size, ONWARD)
+                if behind >= 0.0 and (rim or _leaves(k, behind) or not on_rim(s, c)):
                     best, reached = cosine, behind
                     found, beside, which, how = c, t, i, kind
     return found, beside, which, how, reached
 
 
 @njit(cache=True)
-def _next(s, k, r, least):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _next(s, k, r, rim):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Neighbour of a vertex, or the one across the longest edge of a triangle around it, closest to the path's direction; -1 if none."""
-    found, t, i, kind, reached = _best(s, k, r, True, least)
+    found, t, i, kind, reached = _best(s, k, r, True, rim)
     if found >= 0 and kind == 2 and not swap(s, t, i):
-        found, t, i, kind, reached = _best(s, k, r, False, least)
+        found, t, i, kind, reached = _best(s, k, r, False, rim)
     return found, reached
+
+
+@njit(cache=True)
+def _ahead_of(s, k, r):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Triangle around a vertex through which the straight way back to the path leads, the vertex's corner, and the share of its edge."""
+    count, _ = fan(s, r, k.around)
+    p, t, i, share, best = s.position, -1, 0, 0.5, 0.0
+    ax, ay, az = along(k.points, k.length, k.whole[COUNT], k.real[AT] + 0.5 * k.real[DISTANCE])
+    ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
+    for h in range(count):
+        u = k.around[h]
+        j = corner(s, u, r)
+        b, c = s.triangles[u, (j + 1) % 3], s.triangles[u, (j + 2) % 3]
+        bx, by, bz = from_to(p, r, b)
+        cx, cy, cz = from_to(p, r, c)
+        bb, bc, cc = dot(bx, by, bz, bx, by, bz), dot(bx, by, bz, cx, cy, cz), dot(cx, cy, cz, cx, cy, cz)
+        ab, ac, det = dot(ax, ay, az, bx, by, bz), dot(ax, ay, az, cx, cy, cz), bb * cc - bc * bc
+        if det <= 0.0:
+            continue
+        g, f = (cc * ab - bc * ac) / det, (bb * ac - bc * ab) / det  # the way in the plane of the triangle
+        if f < 0.0:
+            g, f = ab / bb, 0.0
+        elif g < 0.0:
+            g, f = 0.0, ac / cc
+        gain = g * ab + f * ac  # square of its part within the triangle
+        if g >= 0.0 and f >= 0.0 and gain > best:
+            t, i, share, best = u, j, f / (g + f), gain
+    return t, i, share
+
+
+@njit(cache=True)
+def _divided(s, k, r, rim):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Vertex that divides an edge where the straight way back to the path crosses it, and the length beside it; -1 if none."""
+    t, i, exact = _ahead_of(s, k, r)
+    if t < 0:
+        return -1, -1.0
+    b, c, new = s.triangles[t, (i + 1) % 3], s.triangles[t, (i + 2) % 3], s.n[0]
+    for share in (min(max(exact, BLUNT), 1.0 - BLUNT), min(max(exact, HARDLY), 1.0 - HARDLY)):
+        for h in range(3):
+            s.position[new, h] = (1.0 - share) * s.position[b, h] + share * s.position[c, h]
+        x, y, z = from_to(s.position, r, new)
+        reached = _fits(s, k, r, new, np.sqrt(dot(x, y, z, x, y, z)), HARDLY)
+        if reached >= 0.0 and (rim or s.neighbours[t, i] != -1 or _leaves(k, reached)):
+            divide(s, t, i, share)
+            return new, reached
+    return -1, -1.0
 
 
 @njit(cache=True)
@@ -144,9 +202,15 @@ def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     for h in range(FINEST + 1):
         if not free and not refine_around(s, r, distance * 0.5**h, k.around):
             return FULL
-        c, reached = _next(s, k, r, ONWARD)
+        if not has_room(s):
+            return FULL
+        c, reached = _next(s, k, r, free)
         if c < 0 and not free and h == FINEST:
-            c, reached = _next(s, k, r, HARDLY)
+            c, reached = _divided(s, k, r, False)
+            if c < 0:
+                c, reached = _next(s, k, r, True)
+            if c < 0:
+                c, reached = _divided(s, k, r, True)
         if c >= 0:
             ends_here = on_boundary(s, c, k.around)
             if not separate(s, r, c):
@@ -155,7 +219,7 @@ def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
             whole[EDGES] += 1
             whole[NOW], whole[AT_BOUNDARY], k.real[AT] = c, ends_here, reached
             return STEPPED
-        if free or (final and left < 0.5 * distance):
+        if free or (final and left < 0.5 * distance and k.over[whole[COUNT] - 1] == INSIDE):
             break
     return ENDED if left < distance or free else STUCK
 

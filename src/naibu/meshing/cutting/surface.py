@@ -200,6 +200,6 @@ def _arrays(start: LinkedSurface) -> SurfaceArrays:
     at[triangles.ravel()] = np.repeat(np.arange(t), 3)
     own, none, zero = np.arange(n), np.full((n, 2), -1, dtype=np.int64), np.zeros(t, dtype=np.int64)
     edges = int(number_edges(neighbours, sides))
-    rows = [points, points, triangles, neighbours, at, own, none, own, np.arange(t), zero - 1, sides, zero, zero, zero]
+    rows = [points, points, triangles, neighbours, at, own, none, np.zeros(n), own, np.arange(t), zero - 1, sides, zero, zero, zero]
     room: list[Any] = [_grown(np.ascontiguousarray(a), len(a) // 2 + 20_000) for a in rows]
     return SurfaceArrays(*[*room, np.array([n, t, 0, edges, 0])])
