@@ -10,6 +10,7 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 
 MOST_AROUND = 512  # triangles at a vertex
+INSIDE, RIM, LIP = 1, 2, 3  # where a vertex, or the path of a tool, lies
 
 
 class SurfaceArrays(NamedTuple):
@@ -178,8 +179,8 @@ def on_boundary(s, v, out):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def on_rim(s, v):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Whether a vertex lies on the boundary of the surface as it was before any cut."""
+def on_edge_of(s, v):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether a vertex lies INSIDE the surface, on its RIM as it was before any cut, or only on a LIP of a cut."""
     t = s.at[v]
     while True:  # clockwise to the beginning
         back = s.neighbours[t, (corner(s, t, v) + 2) % 3]
@@ -187,13 +188,13 @@ def on_rim(s, v):  # type: ignore[no-untyped-def]  # pragma: no cover
             break
         t = back
         if t == s.at[v]:
-            return False
+            return INSIDE
     while back != -1:
         back = s.neighbours[t, (corner(s, t, v) + 1) % 3]
         if back < 0:
             break
         t = back
-    return back == -1
+    return RIM if back == -1 else LIP
 
 
 @njit(cache=True)
