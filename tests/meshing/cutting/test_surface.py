@@ -272,7 +272,7 @@ def test_what_cannot_be_cut_is_refused(change, said):
 
 
 def sheet(seed: int, height: float = 0.0):
-    """Return Delaunay's triangles of random points in a square, as a wave: those on its sides are flatter the nearer a point lies to one."""
+    """Return Delaunay's triangles of random points in a square, as a wave: those on its sides are flat where a point lies near a side."""
     rng = np.random.default_rng(seed)
     flat = np.concatenate([rng.uniform(0.0, 100.0, (150, 2)), [[0.0, 0.0], [100.0, 0.0], [100.0, 100.0], [0.0, 100.0]]])
     begin, end = np.random.default_rng(1000 + seed).uniform(10.0, 90.0, 2)
