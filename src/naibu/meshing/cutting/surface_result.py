@@ -169,9 +169,7 @@ def cut_result(
     )  # fmt: skip
 
 
-def _bridges(
-    points: FloatArray, lips: IntArray, paths: Sequence[ToolPath], closed: Sequence[bool], within_mm: float
-) -> FloatArray:
+def _bridges(points: FloatArray, lips: IntArray, paths: Sequence[ToolPath], closed: Sequence[bool], within_mm: float) -> FloatArray:
     """Ends of the cut inside the surface but for the nearest to each inside end of the path, and where the path leaves without the cut.
 
     Inside, the lips of a cut turn back on themselves; on the boundary one begins and the other ends.
