@@ -252,7 +252,7 @@ def test_a_plane_through_a_cube_leaves_two_pieces_and_no_splinter(seed: int, dis
 
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5, 38, 49, 58, 74, 96])
 def test_planes_that_cross_at_more_than_half_a_right_angle_leave_four_pieces(seed: int) -> None:
-    """And no splinters where they meet; on cubes and on Delaunay's cells; the first cut is followed by another of the mesh as it is, or of its forest."""
+    """And no splinters, on cubes and on Delaunay's cells; the second cut is of the mesh as it is, or of its forest."""
     rng = np.random.default_rng(seed)
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     angle = rng.uniform(np.pi / 4, np.pi / 2)
