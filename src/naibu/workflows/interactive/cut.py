@@ -271,7 +271,7 @@ def _cards(numbers: Mapping[str, Any]) -> tuple[Card, ...]:
     volumes = [f"{1e-3 * v:.3g}" for v in numbers["volumes_mm3"]]
     return (
         Card("Pieces", str(numbers["pieces"]), f"{', '.join(volumes[:4])}{', ...' if len(volumes) > 4 else ''} cm³"),
-        Card("Area of the cut", f"{1e-2 * numbers['area_of_the_cut_mm2']:.3g} cm²", "of its facets, rougher than the blade's surface"),
+        Card("Area of the cut", f"{1e-2 * numbers['area_of_the_cut_mm2']:.3g} cm²", "of its facets, rougher than the blade"),
         Card("Largest distance from the blade", length_text(numbers["largest_distance_from_the_blade_mm"])),
         Card("Largest opening", f"{numbers['largest_opening_mm']:.3g} mm", f"ends pulled apart by {numbers['pull_percent']:g} %"),
     )
