@@ -134,8 +134,8 @@ def cut(
         if not len(found.faces):
             faces = ", whose cuts follow the faces of its cubes" if isinstance(after, LatticeBody) else ""
             raise InputError(
-                f"{path}: the blade passes beside the body, which reaches {_reach(before.points)}, or only grazes it{faces}; check the path "
-                "and its unit (mm)"
+                f"{path}: the blade passes beside the body, which reaches {_reach(before.points)}, or only grazes it{faces}; check the "
+                "path and its unit (mm)"
             )
         a, b, c = after.points[found.faces].transpose(1, 0, 2)
         areas = 0.5 * np.cross(b - a, c - a)
