@@ -169,7 +169,7 @@ def cut(
 
 
 def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, overwrite: bool, options: dict[str, Any]) -> None:
-    from naibu.workflows.interactive.cut_surface import areas_text, length_text
+    from naibu.workflows.interactive.cut_surface import areas_text, incomplete_text, length_text
     from naibu.workflows.interactive.cut_surface import cut_surface_file as run
 
     stated = {name: value for name, value in options.items() if value is not None}
@@ -182,8 +182,8 @@ def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, 
     )
     for repair in done.cut.repairs:
         say(f"Before the cut: {repair}.")
-    if done.cut.missed_mm:
-        say(f"No cut was found for {done.cut.missed_mm:.3g} mm of the path.")
+    if incomplete := incomplete_text(done.cut, done.numbers["refined"]):
+        say(incomplete)
     say(f"Page: {done.files[0]}   {', '.join(str(file) for file in done.files[1:])}")
 
 

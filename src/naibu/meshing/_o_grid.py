@@ -9,10 +9,9 @@ from scipy.sparse import coo_array, csr_array, diags_array
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.mesh import Mesh
+from naibu.meshing.element_conversion import HEXAHEDRON_EDGES
 from naibu.meshing.quality import scaled_jacobians
 from naibu.meshing.surface import faces_of_cells
-
-_EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
 # Sweeps without improvement of the worst cell after which smoothing stops.
 _PATIENCE = 8
@@ -132,7 +131,7 @@ def _worst(points: FloatArray, cells: IntArray) -> float:
 
 def _neighbour_mean(cells: IntArray, n: int) -> csr_array:
     """Return the matrix (n, n) that averages the neighbours along edges."""
-    ends = cells[:, _EDGES].reshape(-1, 2)
+    ends = cells[:, HEXAHEDRON_EDGES].reshape(-1, 2)
     ones = np.ones(2 * len(ends))
     links = coo_array((ones, (np.concatenate([ends[:, 0], ends[:, 1]]), np.concatenate([ends[:, 1], ends[:, 0]]))), shape=(n, n)).tocsr()
     links.data[:] = 1.0

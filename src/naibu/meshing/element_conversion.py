@@ -26,6 +26,7 @@ _FAR_FACES = np.array([[1, 2, 6, 5], [3, 7, 6, 2], [4, 5, 6, 7]])
 _QUAD_TURNS = (np.arange(4)[:, None] + np.arange(4)) % 4
 # Edges of a tetrahedron in the order in which VTK numbers the mid-edge nodes of a quadratic tetrahedron.
 TETRA_EDGES = np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]])
+HEXAHEDRON_EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
 
 
 def split_hexahedra(cells: IntArray) -> IntArray:

@@ -9,16 +9,14 @@ from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.meshing._quality_kernels import largest_cosine
+from naibu.meshing.element_conversion import HEXAHEDRON_EDGES, TETRA_EDGES
 
 # The three neighbours of every corner, in the order that makes a positive triple product in a good cell.
 _CORNERS = {
     "hexahedron": np.array([[1, 3, 4], [2, 0, 5], [3, 1, 6], [0, 2, 7], [7, 5, 0], [4, 6, 1], [5, 7, 2], [6, 4, 3]]),
     "tetra": np.array([[1, 2, 3], [2, 0, 3], [0, 1, 3], [0, 2, 1]]),
 }
-_EDGES = {
-    "hexahedron": np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]]),
-    "tetra": np.array([[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]]),
-}
+_EDGES = {"hexahedron": HEXAHEDRON_EDGES, "tetra": TETRA_EDGES}
 _HEX_SIGNS = np.array([[-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1], [-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]], dtype=float)
 # Degree-3 rule of a tetrahedron (barycentric points, weights of sum 1): exact for the Jacobian of a curved quadratic cell.
 _TETRA_POINTS = np.vstack([np.full((1, 4), 0.25), np.full((4, 4), 1 / 6) + np.eye(4) / 3])

@@ -250,6 +250,42 @@ def test_a_plane_through_a_cube_leaves_two_pieces_and_no_splinter(seed: int, dis
         assert len(np.unique(signs)) <= 1
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5, 38, 49, 58, 74, 96])
+def test_planes_that_cross_at_more_than_half_a_right_angle_leave_four_pieces(seed: int) -> None:
+    """And no splinters, on cubes and on Delaunay's cells; the second cut is of the mesh as it is, or of its forest."""
+    rng = np.random.default_rng(seed)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    angle = rng.uniform(np.pi / 4, np.pi / 2)
+    normals = np.array([[1.0, 0.0, 0.0], [np.cos(angle), np.sin(angle), 0.0]]) @ turn.T
+    centre = np.array([0.0, 0.0, 10.0]) + rng.uniform(-1.5, 1.5, 3)
+    mesh, distance = cube(3) if seed % 2 else _delaunay(rng), float(rng.choice([1.6, 2.4]))
+    forest = None
+    for normal in normals:
+        u = np.linalg.svd(normal[None])[2][1:]
+        cut = cut_volume(
+            mesh, swept_blade(centre + 60.0 * np.array([[-u[0] - u[1], u[1] - u[0]], [u[0] - u[1], u[0] + u[1]]])), distance, forest=forest
+        )
+        check(mesh, cut, distance)
+        mesh, forest = cut.mesh, cut.forest if seed % 4 < 2 else None
+    side = (mesh.points[mesh.cells].mean(axis=1) - centre) @ normals.T
+    far = (np.abs(side) > 0.5 * distance).all(axis=1)
+    above = (side > 0.0) @ [1, 2]
+    pieces = [np.unique(cut.piece[far & (above == quarter)]) for quarter in range(4)]
+    assert sorted(len(piece) for piece in pieces) == [1, 1, 1, 1] and len(np.unique(np.concatenate(pieces))) == 4
+    assert cut.n_pieces == 4
+
+
+def _delaunay(rng: np.random.Generator) -> Mesh:
+    """Random cells of a cube; nodes of its faces and edges have moved along them."""
+    grid = box((SIZE, SIZE, SIZE), (3, 3, 3), cell_type="tetra").points - [0.0, 0.0, 10.0]
+    moved = grid + np.where(np.abs(grid) < 9.9, rng.uniform(-2.0, 2.0, grid.shape), 0.0)
+    points = np.concatenate([moved, rng.uniform(-9.0, 9.0, (20, 3))]) + np.array([0.0, 0.0, 10.0])
+    cells = Delaunay(points).simplices
+    volumes = np.linalg.det(points[cells[:, 1:]] - points[cells[:, :1]])
+    cells[volumes < 0.0] = cells[volumes < 0.0][:, [0, 1, 3, 2]]
+    return Mesh.from_arrays(points, cells[np.abs(volumes) > 1e-6], "tetra")
+
+
 @pytest.mark.parametrize("thickness", [2.4, 1.2])
 def test_slices_that_are_thinner_than_a_cell_are_cut_off(thickness: float) -> None:
     mesh = box((SIZE, SIZE, SIZE), (2, 2, 2), cell_type="tetra")  # centres of cells lie 2.5 mm and more inside

@@ -117,6 +117,13 @@ def test_a_lattice_is_not_cut_nearer_to_the_blade_than_its_cubes_let_it(tmp_path
         cut(study_file(tmp_path), path_file(tmp_path, 0.0, "\n".join(rows) + "\n"), out=tmp_path / "out", distance_mm=1.0)
 
 
+def test_a_blade_within_the_outer_cubes_of_a_lattice_is_refused_with_the_reason(tmp_path: Path) -> None:
+    rows = [f"{x},100.6,-5,{x},100.6,20" for x in (-20, 20)]  # no face lies beyond the centres of these cubes
+    with pytest.raises(InputError, match=r"y from 100 to 116 mm.*or only grazes it, whose cuts follow the faces of its cubes"):
+        cut(study_file(tmp_path), path_file(tmp_path, 0.0, "\n".join(rows) + "\n"), out=tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

@@ -249,3 +249,16 @@ def test_surfaces_that_others_wrote_are_cut_alike(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=said):
             cut_surface_file(tmp_path / f"{name}.wrl", tip, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_cut_whose_sides_still_hang_together_is_told(tmp_path: Path, verb: Callable[..., tuple[int, str]]) -> None:
+    """Without refinement no edge of this coarse sheet leads on near its middle, and the cut goes on behind."""
+    x = np.linspace(-2.0, SIZE + 2.0, 200)
+    rows = [f"{a},{b},{2.0 * np.sin(0.15 * a)}" for a, b in zip(x, np.linspace(5.0, 38.0, 200), strict=True)]
+    path, out = path_file(tmp_path, text="\n".join(rows)), tmp_path / "out"
+    code, said = verb(surface_file(tmp_path, shape=sheet(6)), "--path", path, "--distance-mm", 2, "--no-refine", "--out", out)
+    places = np.array(json.loads((out / "cut.json").read_text())["places_where_the_sides_hang_together_mm"])
+    sentence = "its two sides still hang together"
+    assert code == 0 and sentence in " ".join(said.split()) and sentence in (out / "cut.html").read_text()
+    gaps = [np.hypot(*(np.array([a, b]) - places[0, :2])) for a, b in zip(x, np.linspace(5.0, 38.0, 200), strict=True)]
+    assert len(places) == 2 and min(gaps) < SIZE / 6

@@ -173,20 +173,18 @@ def components(cells, leaves, count, label, queue):  # type: ignore[no-untyped-d
 def small_pieces(cells, faces, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Which of the two cells (f, 2) beside every face belong to pieces of `most` cells at most, where the faces are open."""
     small = np.zeros((len(faces), 2), dtype=np.bool_)
-    piece = np.empty(most + 1, dtype=np.int64)
+    piece, met = np.empty(most + 1, dtype=np.int64), np.full(len(cells), -1, dtype=np.int64)
     for f in range(len(faces)):
         for side in range(2):
             piece[0], size, at = faces[f, 2 * side], 1, 0
+            met[piece[0]] = 2 * f + side
             while at < size and size <= most:
                 t = piece[at]
                 at += 1
                 for s in range(4):
                     u = cells[t, 4 + s]
-                    known = u < 0 or size > most
-                    for i in range(size):
-                        known |= piece[i] == u
-                    if not known:
-                        piece[size] = u
+                    if u >= 0 and size <= most and met[u] != 2 * f + side:
+                        met[u], piece[size] = 2 * f + side, u
                         size += 1
             small[f, side] = size <= most
     return small

@@ -10,6 +10,7 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 
 MOST_AROUND = 512  # triangles at a vertex
+INSIDE, RIM, LIP = 1, 2, 3  # where a vertex, or the path of a tool, lies
 
 
 class SurfaceArrays(NamedTuple):
@@ -21,7 +22,8 @@ class SurfaceArrays(NamedTuple):
     neighbours: IntArray  # (t, 3) across the edge opposite to each corner; -1 where there is none, -2 where it was cut off
     at: IntArray  # (v,) one of the triangles of a vertex
     twin: IntArray  # (v,) next vertex in the ring of copies
-    ends: IntArray  # (v, 2) ends of the edge that a vertex halves, -1 of others
+    ends: IntArray  # (v, 2) ends of the edge that a vertex divides, -1 of others
+    share: FloatArray  # (v,) of that edge before the vertex: one half but where a cut found no edge that led on, 0 for others
     source: IntArray  # (v,) vertex that a vertex was copied from, itself of others
     parent: IntArray  # (t,) triangle of the surface before that a triangle is a part of
     next_part: IntArray  # (t,) next triangle in the list of these parts, which begins with the number of the triangle before; -1 at its end
@@ -81,8 +83,8 @@ def _set(s, t, vertices, neighbours, sides):  # type: ignore[no-untyped-def]  # 
 
 
 @njit(cache=True)
-def _halve(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Bisect the edge opposite to corner i, and the triangles on both of its sides."""
+def divide(s, t, i, share):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Divide the edge opposite to corner i, at a share of it from corner i + 1, and the triangles on both of its sides."""
     a, b, c = s.triangles[t, i], s.triangles[t, (i + 1) % 3], s.triangles[t, (i + 2) % 3]
     u, beside_b, beside_c = s.neighbours[t, i], s.neighbours[t, (i + 1) % 3], s.neighbours[t, (i + 2) % 3]
     m, t2 = s.n[0], s.n[1]
@@ -90,13 +92,13 @@ def _halve(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
     s.n[0] += 1
     s.n[1] += 1 if u < 0 else 2
     for k in range(3):
-        s.rest[m, k] = 0.5 * (s.rest[b, k] + s.rest[c, k])
-        s.position[m, k] = 0.5 * (s.position[b, k] + s.position[c, k])
-    s.twin[m], s.source[m], s.ends[m, 0], s.ends[m, 1] = m, m, b, c
+        s.rest[m, k] = (1.0 - share) * s.rest[b, k] + share * s.rest[c, k]
+        s.position[m, k] = (1.0 - share) * s.position[b, k] + share * s.position[c, k]
+    s.twin[m], s.source[m], s.ends[m, 0], s.ends[m, 1], s.share[m] = m, m, b, c, share
     s.stamp[t2], s.parent[t2], s.marked[t2] = 0, s.parent[t], 0
     s.next_part[t2], s.next_part[t] = s.next_part[t], t2
     e0, at_b, at_c = s.sides[t, i], s.sides[t, (i + 1) % 3], s.sides[t, (i + 2) % 3]
-    e1, e2 = s.n[3], s.n[3] + 1  # the second half of the edge, and the edge to the opposite corner
+    e1, e2 = s.n[3], s.n[3] + 1  # the second part of the edge, and the edge to the opposite corner
     s.n[3] += 2 if u < 0 else 3
     if u >= 0:
         j = 0
@@ -116,6 +118,12 @@ def _halve(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
+def has_room(s):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether one more edge can be divided."""
+    return s.n[0] + 1 < len(s.at) and s.n[1] + 2 < len(s.triangles)
+
+
+@njit(cache=True)
 def bisect(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Bisect a triangle and what its longest-edge propagation path makes necessary; False where there is no room."""
     while True:
@@ -126,9 +134,9 @@ def bisect(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
             if u < 0 or s.neighbours[u, longest(s, u)] == now:
                 break
             now = u
-        if s.n[0] + 1 >= len(s.at) or s.n[1] + 2 >= len(s.triangles):
+        if not has_room(s):
             return False
-        _halve(s, now, i)
+        divide(s, now, i, 0.5)
         if now == t or u == t:
             return True
 
@@ -168,6 +176,25 @@ def fan(s, v, out):  # type: ignore[no-untyped-def]  # pragma: no cover
 def on_boundary(s, v, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether a vertex lies on the boundary or on a lip of a cut."""
     return not fan(s, v, out)[1]
+
+
+@njit(cache=True)
+def on_edge_of(s, v):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether a vertex lies INSIDE the surface, on its RIM as it was before any cut, or only on a LIP of a cut."""
+    t = s.at[v]
+    while True:  # clockwise to the beginning
+        back = s.neighbours[t, (corner(s, t, v) + 2) % 3]
+        if back < 0:
+            break
+        t = back
+        if t == s.at[v]:
+            return INSIDE
+    while back != -1:
+        back = s.neighbours[t, (corner(s, t, v) + 1) % 3]
+        if back < 0:
+            break
+        t = back
+    return RIM if back == -1 else LIP
 
 
 @njit(cache=True)
@@ -222,7 +249,7 @@ def _resolve(s, v, around, count):  # type: ignore[no-untyped-def]  # pragma: no
         if k > 0 and s.neighbours[t, (i + 2) % 3] < 0:
             now = s.n[0]
             s.n[0] += 1
-            s.rest[now], s.position[now], s.ends[now] = s.rest[v], s.position[v], -1
+            s.rest[now], s.position[now], s.ends[now], s.share[now] = s.rest[v], s.position[v], -1, 0.0
             s.source[now], s.twin[now], s.twin[v] = v, s.twin[v], now
         s.triangles[t, i] = now
         s.at[now] = t

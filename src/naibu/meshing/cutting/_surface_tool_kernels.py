@@ -6,6 +6,7 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 from naibu.meshing.cutting._surface_grid_kernels import nearest_listed
+from naibu.meshing.cutting._surface_kernels import INSIDE, RIM
 from naibu.meshing.cutting._surface_search_kernels import dot, first_at, nearest, on_path
 from naibu.meshing.cutting._surface_walk_kernels import (
     AT,
@@ -79,7 +80,7 @@ def sample(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no
         append(k, tip, tip, t, 0)
     else:
         k.real[HEIGHT] = np.sqrt(d2)
-        append(k, point, tip, t, 2 if beside >= 0.0 else 1)
+        append(k, point, tip, t, RIM if beside >= 0.0 else INSIDE)
 
 
 @njit(cache=True)
@@ -116,13 +117,15 @@ def _enter(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
         i = _ahead(k, final)
         if i < 0:
             return WAITING
-        edge = whole[LEFT_BEFORE] != 0 or k.over[i] == 2
+        k.triangle[i] = nearest(s, k.triangle[i], k.points[i], 2.0 * distance, True, k.queue, point)[0]  # it may have been cut since
+        edge = whole[LEFT_BEFORE] != 0 or k.over[i] == RIM
         target[:] = real[LAST : LAST + 3] if whole[LEFT_BEFORE] else k.points[i]
         j = i - 1
         while j >= 0 and k.over[j] != 0 and k.length[j] >= real[AT] - distance:
             j -= 1
         if j >= 0 and k.over[j] == 0 and k.length[j] >= real[AT] - distance:
             i, edge = j + 1, True
+            k.triangle[i] = nearest(s, k.triangle[i], k.points[i], 2.0 * distance, True, k.queue, point)[0]
             _crossing(s, k, i, target, point)
         low, high = max(real[AT], k.length[i] - 2.0 * distance), k.length[i] + distance
         found = begin(s, k, k.triangle[i], target, low, high, edge, point)

@@ -8,13 +8,29 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
-from naibu.meshing.cutting._surface_kernels import bisect, corner, fan, on_boundary, separate, size2, swap
-from naibu.meshing.cutting._surface_search_kernels import along, dot, from_to, nearest, nearest_on_triangle, on_path
+from naibu.meshing.cutting._surface_kernels import (
+    INSIDE,
+    LIP,
+    RIM,
+    bisect,
+    corner,
+    divide,
+    fan,
+    has_room,
+    on_boundary,
+    on_edge_of,
+    separate,
+    size2,
+    swap,
+)
+from naibu.meshing.cutting._surface_search_kernels import along, dot, first_at, from_to, nearest, nearest_on_triangle, on_path
 
 WAITING, STEPPED, LEFT, ENDED, STUCK, FULL = 0, 1, 2, 3, 4, 5
 NO_ROOM = -2
+RECENT = 3.0  # distances: length of the latest edges of a cut, onto which it does not turn back
 FINEST = 4  # times that the allowed edge is halved where no edge leads on
-ONWARD, HARDLY = 0.1, 1e-3  # of an edge: how much further along the path it leads, and among flat triangles that bisection keeps flat
+ONWARD, HARDLY = 0.1, 1e-3  # of an edge: how much further along the path it leads, and where an edge is divided for want of one
+BLUNT = 0.1  # of an edge: its parts are not shorter, where the way through it allows that
 
 # entries of `ToolArrays.whole`: lengths of the path and of the list of cut edges, where the cut is, and how far a movement has come
 COUNT, EDGES, NOW, AT_BOUNDARY, BEGAN, LEFT_BEFORE, FREE, PIECE, PIECES, SAMPLED = range(10)
@@ -30,7 +46,7 @@ class ToolArrays(NamedTuple):
     length: FloatArray  # (p,) of the path so far, mm
     tips: FloatArray  # (p, 3) mm
     triangle: IntArray  # (p,) beneath
-    over: IntArray  # (p,) 1 over the surface, 2 on its boundary, 0 beside
+    over: IntArray  # (p,) 0 beside the surface, INSIDE its boundary, or over its RIM
     edges: IntArray  # (k, 2) that were cut, over all paths
     queue: IntArray
     around: IntArray
@@ -59,10 +75,16 @@ def _fits(s, k, r, c, size, least):  # type: ignore[no-untyped-def]  # pragma: n
     p, m, at, distance = s.position, k.whole[COUNT], k.real[AT], k.real[DISTANCE]
     high = at + 3.0 * max(size, distance)
     gap, reached = on_path(k.points, k.length, m, p[c, 0], p[c, 1], p[c, 2], at, high)
+    onward = reached > at + least * size
     if k.length[m - 1] - at < distance:
-        if _from_end2(s, k, c) >= _from_end2(s, k, r):
-            return -1.0
-    elif reached <= at + least * size:
+        nearer = _from_end2(s, k, c) < _from_end2(s, k, r)
+        if k.over[m - 1] == INSIDE:  # the end of the path is where the cut is to end
+            onward = nearer
+        elif not onward and nearer:  # beyond the end of the path, too, it leads over the boundary
+            x, y, z = from_to(p, r, c)
+            ax, ay, az = from_to(k.points, m - 2, m - 1)
+            onward = dot(x, y, z, ax, ay, az) > least * size * (k.length[m - 1] - k.length[m - 2])
+    if not onward:
         return -1.0
     if k.whole[FREE]:
         return reached
@@ -77,6 +99,41 @@ def _fits(s, k, r, c, size, least):  # type: ignore[no-untyped-def]  # pragma: n
 
 
 @njit(cache=True)
+def _leaves(s, k, r):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether the path leaves the surface within two distances ahead of the cut, as far as it is known."""
+    m, at = k.whole[COUNT], k.real[AT]
+    j = first_at(k.length, m, at)
+    while j < m and k.over[j] != INSIDE and on_edge_of(s, r) == RIM:
+        j += 1  # it has just come over the surface
+    while j < m and k.length[j] <= at + 2.0 * k.real[DISTANCE]:
+        if k.over[j] != INSIDE:
+            return True
+        j += 1
+    return False
+
+
+@njit(cache=True)
+def _turns_back(s, k, c):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether a vertex lies on the latest edges of the cut."""
+    p, e, gone, distance = s.position, k.whole[EDGES] - 1, 0.0, k.real[DISTANCE]
+    while e >= 0 and gone < RECENT * distance:
+        a, b = k.edges[e, 0], k.edges[e, 1]
+        if nearest_on_triangle(p, a, b, b, p[c, 0], p[c, 1], p[c, 2])[0] < (1e-9 * distance) ** 2:
+            return True
+        x, y, z = from_to(p, a, b)
+        gone += np.sqrt(dot(x, y, z, x, y, z))
+        e -= 1
+    return False
+
+
+@njit(cache=True)
+def _may_end_at(s, k, r, c):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether the cut may go to a vertex: not to the boundary unless the path leaves the surface, nor back to where it comes from."""
+    where = on_edge_of(s, c)
+    return where == INSIDE or (where == RIM and _leaves(s, k, r)) or (where == LIP and not _turns_back(s, k, c))
+
+
+@njit(cache=True)
 def _from_end2(s, k, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     last = k.whole[COUNT] - 1
     x, y, z = s.position[v, 0] - k.points[last, 0], s.position[v, 1] - k.points[last, 1], s.position[v, 2] - k.points[last, 2]
@@ -84,8 +141,11 @@ def _from_end2(s, k, v):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def _best(s, k, r, across, least):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Vertex whose edge lies closest to the direction of the path, -1 if none, its triangle, corner and kind, and the length beside it."""
+def _best(s, k, r, across, anywhere):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Vertex whose edge lies closest to the direction of the path, -1 if none, its triangle, corner and kind, and the length beside it.
+
+    On the boundary of the surface only where the path leaves it there, on a lip only of an earlier cut, unless `anywhere`.
+    """
     count, _ = fan(s, r, k.around)
     best, reached, found, beside, which, how = 0.0, -1.0, -1, -1, 0, 0
     p, at, m = s.position, k.real[AT], k.whole[COUNT]
@@ -106,27 +166,69 @@ def _best(s, k, r, across, least):  # type: ignore[no-untyped-def]  # pragma: no
             x, y, z = from_to(p, r, c)
             size = np.sqrt(dot(x, y, z, x, y, z))
             ax, ay, az = along(k.points, k.length, m, at + max(size, 0.5 * k.real[DISTANCE]))
-            if least < ONWARD:  # along the path, not back towards it
-                bx, by, bz = along(k.points, k.length, m, at)
-                ax, ay, az = ax - bx, ay - by, az - bz
-            else:
-                ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
+            ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
             cosine = dot(x, y, z, ax, ay, az) / max(size * np.sqrt(dot(ax, ay, az, ax, ay, az)), 1e-300)
             if cosine > best + (1e-9 if kind == 2 else 0.0):
-                behind = _fits(s, k, r, c, size, least)
-                if behind >= 0.0:
+                behind = _fits(s, k, r, c, size, ONWARD)
+                if behind >= 0.0 and (anywhere or _may_end_at(s, k, r, c)):
                     best, reached = cosine, behind
                     found, beside, which, how = c, t, i, kind
     return found, beside, which, how, reached
 
 
 @njit(cache=True)
-def _next(s, k, r, least):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _next(s, k, r, anywhere):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Neighbour of a vertex, or the one across the longest edge of a triangle around it, closest to the path's direction; -1 if none."""
-    found, t, i, kind, reached = _best(s, k, r, True, least)
+    found, t, i, kind, reached = _best(s, k, r, True, anywhere)
     if found >= 0 and kind == 2 and not swap(s, t, i):
-        found, t, i, kind, reached = _best(s, k, r, False, least)
+        found, t, i, kind, reached = _best(s, k, r, False, anywhere)
     return found, reached
+
+
+@njit(cache=True)
+def _ahead_of(s, k, r):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Triangle around a vertex through which the straight way back to the path leads, the vertex's corner, and the share of its edge."""
+    count, _ = fan(s, r, k.around)
+    p, t, i, share, best = s.position, -1, 0, 0.5, 0.0
+    ax, ay, az = along(k.points, k.length, k.whole[COUNT], k.real[AT] + 0.5 * k.real[DISTANCE])
+    ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
+    for h in range(count):
+        u = k.around[h]
+        j = corner(s, u, r)
+        b, c = s.triangles[u, (j + 1) % 3], s.triangles[u, (j + 2) % 3]
+        bx, by, bz = from_to(p, r, b)
+        cx, cy, cz = from_to(p, r, c)
+        bb, bc, cc = dot(bx, by, bz, bx, by, bz), dot(bx, by, bz, cx, cy, cz), dot(cx, cy, cz, cx, cy, cz)
+        ab, ac, det = dot(ax, ay, az, bx, by, bz), dot(ax, ay, az, cx, cy, cz), bb * cc - bc * bc
+        if det <= 0.0:
+            continue
+        g, f = (cc * ab - bc * ac) / det, (bb * ac - bc * ab) / det  # the way in the plane of the triangle
+        if f < 0.0:
+            g, f = ab / bb, 0.0
+        elif g < 0.0:
+            g, f = 0.0, ac / cc
+        gain = g * ab + f * ac  # square of its part within the triangle
+        if g >= 0.0 and f >= 0.0 and gain > best:
+            t, i, share, best = u, j, f / (g + f), gain
+    return t, i, share
+
+
+@njit(cache=True)
+def _divided(s, k, r, anywhere):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Vertex that divides an edge where the straight way back to the path crosses it, and the length beside it; -1 if none."""
+    t, i, exact = _ahead_of(s, k, r)
+    if t < 0:
+        return -1, -1.0
+    b, c, new = s.triangles[t, (i + 1) % 3], s.triangles[t, (i + 2) % 3], s.n[0]
+    for share in (min(max(exact, BLUNT), 1.0 - BLUNT), min(max(exact, HARDLY), 1.0 - HARDLY)):
+        for h in range(3):
+            s.position[new, h] = (1.0 - share) * s.position[b, h] + share * s.position[c, h]
+        x, y, z = from_to(s.position, r, new)
+        reached = _fits(s, k, r, new, np.sqrt(dot(x, y, z, x, y, z)), HARDLY)
+        if reached >= 0.0 and (anywhere or s.neighbours[t, i] >= 0 or (s.neighbours[t, i] == -1 and _leaves(s, k, r))):
+            divide(s, t, i, share)
+            return new, reached
+    return -1, -1.0
 
 
 @njit(cache=True)
@@ -144,9 +246,15 @@ def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     for h in range(FINEST + 1):
         if not free and not refine_around(s, r, distance * 0.5**h, k.around):
             return FULL
-        c, reached = _next(s, k, r, ONWARD)
+        if not has_room(s):
+            return FULL
+        c, reached = _next(s, k, r, free)
         if c < 0 and not free and h == FINEST:
-            c, reached = _next(s, k, r, HARDLY)
+            c, reached = _divided(s, k, r, False)
+            if c < 0:
+                c, reached = _next(s, k, r, True)
+            if c < 0:
+                c, reached = _divided(s, k, r, True)
         if c >= 0:
             ends_here = on_boundary(s, c, k.around)
             if not separate(s, r, c):
@@ -155,15 +263,27 @@ def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
             whole[EDGES] += 1
             whole[NOW], whole[AT_BOUNDARY], k.real[AT] = c, ends_here, reached
             return STEPPED
-        if free or (final and left < 0.5 * distance):
+        if free or (final and left < 0.5 * distance and k.over[whole[COUNT] - 1] == INSIDE):
             break
     return ENDED if left < distance or free else STUCK
 
 
 @njit(cache=True)
-def _end_near(s, t, q, edge, count, queue):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Triangle and vertex whose edge, of a triangle or among those of the boundary nearby if `edge`, is nearest to q; -1 if none."""
-    best, where, found, gap, p = np.inf, -1, -1, np.inf, s.position
+def _leads_into(p, o, a, b, ahead):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether a direction leads over edge a-b towards the side on which corner o lies."""
+    ex, ey, ez = from_to(p, a, b)
+    ox, oy, oz = from_to(p, a, o)
+    f = dot(ox, oy, oz, ex, ey, ez) / dot(ex, ey, ez, ex, ey, ez)
+    return dot(ox - f * ex, oy - f * ey, oz - f * ez, ahead[0], ahead[1], ahead[2]) > 0.0
+
+
+@njit(cache=True)
+def _end_near(s, t, q, ahead, same2, edge, count, queue):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Triangle and vertex whose edge, of a triangle or among those of the boundary nearby if `edge`, is nearest to q; -1 if none.
+
+    Of the two lips of a cut, whose distances are the same, the one that lies ahead.
+    """
+    best, where, found, gap, into, p = np.inf, -1, -1, np.inf, False, s.position
     for h in range(count if edge else 1):
         u = queue[h] if edge else t
         for i in range(3):
@@ -175,22 +295,26 @@ def _end_near(s, t, q, edge, count, queue):  # type: ignore[no-untyped-def]  # p
             da = dot(x, y, z, x, y, z)
             x, y, z = p[b, 0] - q[0], p[b, 1] - q[1], p[b, 2] - q[2]
             db = dot(x, y, z, x, y, z)
-            if d2 < best or (d2 == best and min(da, db) < gap):
-                best, where, found, gap = d2, u, a if da < db else b, min(da, db)
+            onto = edge and _leads_into(p, s.triangles[u, i], a, b, ahead)
+            as_near = abs(d2 - best) <= same2
+            if (d2 < best and not as_near) or (as_near and (onto, -min(da, db)) > (into, -gap)):
+                best, where, found, gap, into = d2, u, a if da < db else b, min(da, db), onto
     return where, found
 
 
 @njit(cache=True)
 def begin(s, k, t, q, low, high, edge, point):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vertex near q within half the distance of the path, on the boundary if `edge`; -1 if there is none, -2 where there is no room."""
-    distance, free, found = k.real[DISTANCE], k.whole[FREE], -1
+    distance, free, found, ahead = k.real[DISTANCE], k.whole[FREE], -1, np.empty(3)
+    ahead[:] = along(k.points, k.length, k.whole[COUNT], high)
+    ahead -= q
     for h in range(FINEST + 1):
         bound = distance * 0.5**h
         while True:
             t, _, _, count = nearest(s, t, q, 2.0 * distance, False, k.queue, point)
             if edge:  # in the order around that triangle
                 _, _, _, count = nearest(s, t, q, 2.0 * distance, False, k.queue, point)
-            where, found = _end_near(s, t, q, edge, count, k.queue)
+            where, found = _end_near(s, t, q, ahead, (1e-9 * distance) ** 2, edge, count, k.queue)
             if where < 0 or free or size2(s, where) < bound * bound:
                 break
             if not bisect(s, where):

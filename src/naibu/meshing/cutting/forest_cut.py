@@ -30,7 +30,8 @@ _FACES = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])  # face k is opp
 ROUNDS = 60  # of bisection at most
 MOST_CELLS = 20_000_000
 LEAST_ANGLE = 0.1  # of the smallest dihedral angle of the cells that are bisected; bisection keeps about a fifth of it
-SPLINTER = 4  # cells of a piece that is not cut off where all of it lies as near to the blade as its cut faces may
+SPLINTER = 16  # cells of a piece that is not cut off where all of it lies as near to the blade as its cut faces may
+OF_STEP = 4  # the same where a blade goes on: between steps with refinement, larger ones could hold both sides together
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +144,8 @@ def _cut(
     late = _late(forest, faces, where, whole)
     if len(whole.triangles) > len(blade.triangles):  # where cells are new, what the blade swept before has told already
         late = late[~fresh[late[:, ::2]].any(axis=1)]
-    faces = _opened(forest, np.concatenate([faces, late]), centres, whole, 0.5 * distance_mm)
+    most = SPLINTER if len(whole.triangles) == len(blade.triangles) else OF_STEP
+    faces = _opened(forest, np.concatenate([faces, late]), centres, whole, 0.5 * distance_mm, most)
     copies = _separated(forest, faces)
     apart = _apart(forest, faces)
     kernels.set_open(forest.arrays[0], faces[~apart], 0)
@@ -202,17 +204,26 @@ def _too_coarse(
         within = np.empty(count, dtype=np.int64)
 
 
-def _opened(forest: BisectionForest, faces: IntArray, centres: FloatArray, blade: SweptBlade, near_mm: float) -> IntArray:
-    """Open faces, but not those around splinters: few cells that would be cut off though the blade only grazes them."""
+def _opened(forest: BisectionForest, faces: IntArray, centres: FloatArray, blade: SweptBlade, near_mm: float, most: int) -> IntArray:
+    """Open faces, but not those around splinters: `most` cells or fewer that would be cut off though the blade only grazes them."""
+    kernels.set_open(forest.arrays[0], faces, -1)
+    while (closed := _around_splinters(forest, faces, centres, blade, near_mm, most)).any():
+        kernels.set_open(forest.arrays[0], faces[closed], 0)
+        faces = faces[~closed]  # and those towards splinters that have just been joined
+    return faces
+
+
+def _around_splinters(
+    forest: BisectionForest, faces: IntArray, centres: FloatArray, blade: SweptBlade, near_mm: float, most: int
+) -> BoolArray:
+    """Which open faces (f,) join a splinter to what it shares the largest area with."""
     cells = forest.arrays[0]
-    kernels.set_open(cells, faces, -1)
-    small = kernels.small_pieces(cells, faces, SPLINTER)
+    closed, small = np.zeros(len(faces), dtype=bool), kernels.small_pieces(cells, faces, most)
     if not small.any():
-        return faces
+        return closed
     label = np.full(forest.cell_rows, -1, dtype=np.int64)
     kernels.components(cells, forest.arrays[4], forest.n_cells, label, np.empty(forest.n_cells, dtype=np.int64))
     leaves = forest.leaves()
-    closed = np.zeros(len(faces), dtype=bool)
     for piece in np.unique(label[faces[:, ::2]][small]):
         own = leaves[label[leaves] == piece]
         gap = np.empty(len(own))
@@ -227,8 +238,7 @@ def _opened(forest: BisectionForest, faces: IntArray, centres: FloatArray, blade
         across = 2 * np.where(of_piece[:, 0], label[faces[:, 2]], label[faces[:, 0]]) + of_piece[:, 0]
         area = np.bincount(across[beside], _areas(forest, faces[beside]))
         closed |= beside & (across == int(area.argmax()))
-    kernels.set_open(cells, faces[closed], 0)
-    return faces[~closed]
+    return closed
 
 
 def _areas(forest: BisectionForest, faces: IntArray) -> FloatArray:

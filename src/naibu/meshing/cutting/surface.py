@@ -68,6 +68,7 @@ class SurfaceCutter:
         self._grid = grid_of(start.points, start.triangles, max(size, self.reach_mm))
         self._tool = _tool(self.distance_mm, self.reach_mm, refined)
         self._paths: list[ToolPath] = []
+        self._closed: list[bool] = []
 
     @property
     def n_steps(self) -> int:
@@ -94,6 +95,7 @@ class SurfaceCutter:
             tool_kernels.close(self._tool)
             self._with_room(lambda: int(tool_kernels.walk(self.arrays, self._tool, True)))
             k, count = self._tool, int(whole[walk.COUNT])
+            self._closed.append(bool(np.isfinite(k.real[walk.CLOSING])))
             self._paths.append((k.points[:count].copy(), k.tips[:count].copy(), k.over[:count] > 0))
         _put_down(self._tool)
 
@@ -101,7 +103,7 @@ class SurfaceCutter:
         """Return the surface as it is cut, with the tool lifted."""
         self.lift()
         edges = self._tool.edges[: self.n_steps].copy()
-        return cut_result(self._start, self.arrays, edges, self._paths, self.distance_mm)
+        return cut_result(self._start, self.arrays, edges, self._paths, self._closed, self.distance_mm)
 
     def _with_room(self, attempt: Callable[[], int]) -> None:
         """Repeat what stopped because the arrays are full, with longer ones."""
@@ -200,6 +202,6 @@ def _arrays(start: LinkedSurface) -> SurfaceArrays:
     at[triangles.ravel()] = np.repeat(np.arange(t), 3)
     own, none, zero = np.arange(n), np.full((n, 2), -1, dtype=np.int64), np.zeros(t, dtype=np.int64)
     edges = int(number_edges(neighbours, sides))
-    rows = [points, points, triangles, neighbours, at, own, none, own, np.arange(t), zero - 1, sides, zero, zero, zero]
+    rows = [points, points, triangles, neighbours, at, own, none, np.zeros(n), own, np.arange(t), zero - 1, sides, zero, zero, zero]
     room: list[Any] = [_grown(np.ascontiguousarray(a), len(a) // 2 + 20_000) for a in rows]
     return SurfaceArrays(*[*room, np.array([n, t, 0, edges, 0])])

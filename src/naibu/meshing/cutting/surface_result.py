@@ -17,6 +17,10 @@ from naibu.meshing.cutting.surface_input import LinkedSurface
 
 PARTS = 8  # of an edge at whose ends its distance from the path is measured
 
+NEAR = 1.25  # distances: within this of where the path begins or ends over the surface, so may the cut
+
+FOLDED = 1e-6  # difference of the directions of two lips that are one line
+
 ToolPath = tuple[FloatArray, FloatArray, BoolArray]
 
 
@@ -33,7 +37,10 @@ class SurfaceCut:
     parents : ndarray, shape (t,), int64
         Triangle of the surface before that each is a part of; where an edge was swapped, that of one of the two.
     ends : ndarray, shape (n, 2), int64
-        Ends of the edge that a point halves, -1 for others.
+        Ends of the edge that a point divides, -1 for others.
+    share : ndarray, shape (n,)
+        Of that edge from its first end to the point: one half where triangles were bisected, another where no edge led on and the cut
+        divided one; 0 for other points.
     source : ndarray, shape (n,), int64
         Point that each was copied from when the cut passed it, itself for others.
     piece : ndarray, shape (t,), int64
@@ -50,6 +57,9 @@ class SurfaceCut:
         Mean distance of the cut from the path, mm.
     missed_mm : float
         Length of the path over the surface with no cut within the distance: nowhere did an edge lead on there; mm.
+    bridges : ndarray, shape (b, 3)
+        Where the two sides of the cut still hang together although the path goes on: the cut stops inside the surface, or does not reach
+        the boundary over which the path leaves, mm.
     repairs : tuple of str
         What was mended of the surface before.
     """
@@ -58,6 +68,7 @@ class SurfaceCut:
     triangles: IntArray
     parents: IntArray
     ends: IntArray
+    share: FloatArray
     source: IntArray
     piece: IntArray
     lips: IntArray
@@ -66,6 +77,7 @@ class SurfaceCut:
     deviation_mm: float
     mean_deviation_mm: float
     missed_mm: float
+    bridges: FloatArray
     repairs: tuple[str, ...]
 
     @property
@@ -133,8 +145,10 @@ def triangle_areas(points: FloatArray, triangles: IntArray) -> FloatArray:
     return np.asarray(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
 
 
-def cut_result(before: LinkedSurface, s: SurfaceArrays, edges: IntArray, paths: Sequence[ToolPath], distance_mm: float) -> SurfaceCut:
-    """Return what the arrays of a cutter hold, without their room."""
+def cut_result(
+    before: LinkedSurface, s: SurfaceArrays, edges: IntArray, paths: Sequence[ToolPath], closed: Sequence[bool], distance_mm: float
+) -> SurfaceCut:
+    """Return what the arrays of a cutter hold, without their room; `closed` are the paths that end where they begin."""
     n, t = int(s.n[0]), int(s.n[1])
     triangles, neighbours = s.triangles[:t].copy(), s.neighbours[:t]
     rows, corner = np.nonzero(neighbours >= 0)
@@ -147,10 +161,40 @@ def cut_result(before: LinkedSurface, s: SurfaceArrays, edges: IntArray, paths: 
     rows, corner = np.nonzero(neighbours == -2)
     lips = np.stack([triangles[rows, (corner + 1) % 3], triangles[rows, (corner + 2) % 3]], axis=1)
     cut_edges = s.position[edges]
+    within = max([distance_mm, *np.linalg.norm(cut_edges[:, 1] - cut_edges[:, 0], axis=1)]) * NEAR
+    bridges = _bridges(points, lips, paths, closed, within)
     return SurfaceCut(
-        points, triangles, s.parent[:t].copy(), s.ends[:n].copy(), s.source[:n].copy(), rank[label], lips, cut_edges, tuple(paths),
-        *_deviations(cut_edges, paths), _missed(cut_edges, paths, distance_mm), before.repairs,
+        points, triangles, s.parent[:t].copy(), s.ends[:n].copy(), s.share[:n].copy(), s.source[:n].copy(), rank[label], lips, cut_edges,
+        tuple(paths), *_deviations(cut_edges, paths), _missed(cut_edges, paths, distance_mm), bridges, before.repairs,
     )  # fmt: skip
+
+
+def _bridges(points: FloatArray, lips: IntArray, paths: Sequence[ToolPath], closed: Sequence[bool], within_mm: float) -> FloatArray:
+    """Ends of the cut inside the surface but for the nearest to each inside end of the path, and where the path leaves without the cut.
+
+    Inside, the lips of a cut turn back on themselves; on the boundary one begins and the other ends.
+    """
+    before, behind = (np.full(len(points), -1) for _ in range(2))
+    behind[lips[:, 0]], before[lips[:, 1]] = lips[:, 1], lips[:, 0]
+    nodes = np.flatnonzero((before >= 0) & (behind >= 0))
+    one, two = (_directions(points, nodes, other[nodes]) for other in (before, behind))
+    tips = points[nodes[np.linalg.norm(one - two, axis=1) < FOLDED]]
+    rim, missing = points[(before >= 0) != (behind >= 0)], []
+    for (way, _, over), loop in zip(paths, closed, strict=True):
+        for end in (0,) if loop else (0, -1):  # what closes a loop ends on its own lip
+            gaps = np.linalg.norm(tips - way[end], axis=1)
+            if over[end] and gaps.min(initial=np.inf) <= within_mm:
+                tips = np.delete(tips, int(gaps.argmin()), axis=0)
+        turns = np.flatnonzero(over[1:] != over[:-1])
+        for place in way[turns + over[turns + 1]]:  # the first or last point over the surface
+            if np.linalg.norm(rim - place, axis=1).min(initial=np.inf) > within_mm:
+                missing.append(place)
+    return np.concatenate([tips, np.reshape(missing, (-1, 3))])
+
+
+def _directions(points: FloatArray, nodes: IntArray, others: IntArray) -> FloatArray:
+    way = points[others] - points[nodes]
+    return np.asarray(way / np.linalg.norm(way, axis=1, keepdims=True))
 
 
 def _deviations(edges: FloatArray, paths: Sequence[ToolPath]) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from scipy import ndimage
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
+from naibu.meshing.element_conversion import HEXAHEDRON_EDGES
 from naibu.meshing.point_location import locate
 from naibu.meshing.quality import min_jacobians, signed_volumes
 from naibu.meshing.surface import boundary_faces
@@ -130,8 +131,7 @@ def _towards_borders(
 
 def _relaxed(mesh: Mesh, way: FloatArray, border: BoolArray, held: BoolArray) -> FloatArray:
     """Return the ways (n, 3) with those of nodes away from borders as the means of their neighbours', and none along held axes."""
-    edges = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6], [3, 7]])
-    a, b = mesh.cells[:, edges].reshape(-1, 2).T
+    a, b = mesh.cells[:, HEXAHEDRON_EDGES].reshape(-1, 2).T
     ones, shape = np.ones(2 * len(a)), (mesh.n_points, mesh.n_points)
     near = sp.csr_matrix((ones, (np.concatenate([a, b]), np.concatenate([b, a]))), shape=shape)
     near.data[:] = 1.0

@@ -132,9 +132,10 @@ def cut(
             raise InputError(f"lips_friction must be 0, not {lips_friction:g}: the sides of the cut of a lattice do not touch each other")
         before, after, found, distance = _cut(model.body, blade, distance_mm)
         if not len(found.faces):
+            faces = ", whose cuts follow the faces of its cubes" if isinstance(after, LatticeBody) else ""
             raise InputError(
-                f"{path}: the blade passes beside the body, which reaches {_reach(before.points)}, or only grazes it; check the path and "
-                "its unit (mm)"
+                f"{path}: the blade passes beside the body, which reaches {_reach(before.points)}, or only grazes it{faces}; check the "
+                "path and its unit (mm)"
             )
         a, b, c = after.points[found.faces].transpose(1, 0, 2)
         areas = 0.5 * np.cross(b - a, c - a)
@@ -270,7 +271,7 @@ def _cards(numbers: Mapping[str, Any]) -> tuple[Card, ...]:
     volumes = [f"{1e-3 * v:.3g}" for v in numbers["volumes_mm3"]]
     return (
         Card("Pieces", str(numbers["pieces"]), f"{', '.join(volumes[:4])}{', ...' if len(volumes) > 4 else ''} cm³"),
-        Card("Area of the cut", f"{1e-2 * numbers['area_of_the_cut_mm2']:.3g} cm²"),
+        Card("Area of the cut", f"{1e-2 * numbers['area_of_the_cut_mm2']:.3g} cm²", "of its facets, rougher than the blade"),
         Card("Largest distance from the blade", length_text(numbers["largest_distance_from_the_blade_mm"])),
         Card("Largest opening", f"{numbers['largest_opening_mm']:.3g} mm", f"ends pulled apart by {numbers['pull_percent']:g} %"),
     )

@@ -37,6 +37,7 @@ LARGE_POINTS = 30_000  # surfaces of more have fewer frames
 FRAME_S = 0.1
 PAGE_BYTES = 24_000_000
 PAGE_TRIANGLES = 60_000  # those nearest to the cut are shown
+TOLD_BRIDGES = 3
 INSIDE = 0.5  # of the distance: tips deeper than this below the surface cut a groove
 
 
@@ -162,6 +163,18 @@ def areas_text(found: SurfaceCut) -> str:
     return ", ".join(f"{v:.4g}" if v < 1e4 else f"{v:.0f}" for v in found.areas_mm2[:6])
 
 
+def incomplete_text(found: SurfaceCut, refined: bool) -> str:
+    """Return a sentence on what of the path was not cut, empty where nothing of it hangs together."""
+    said = [f"No cut was found for {found.missed_mm:.3g} mm of the path."] if found.missed_mm else []
+    if len(found.bridges):
+        where = "; ".join(", ".join(f"{v:.4g}" for v in place) for place in found.bridges[:TOLD_BRIDGES])
+        count = "one place" if len(found.bridges) == 1 else f"{len(found.bridges)} places"
+        remedy = "a smaller distance" if refined else "refinement"
+        more = ", ..." if len(found.bridges) > TOLD_BRIDGES else ""
+        said.append(f"The cut is not complete: at {count} its two sides still hang together, near {where}{more} mm; {remedy} helps.")
+    return " ".join(said)
+
+
 def mean_edge_mm(surface: Surface) -> float:
     """Return the mean length of the edges of the triangles, mm."""
     corners = surface.points[surface.triangles]
@@ -204,6 +217,7 @@ def _numbers(surface: Surface, found: SurfaceCut, distance: float, wall_area: fl
         "mean_distance_from_the_path_mm": found.mean_deviation_mm,
         "allowed_distance_mm": 0.5 * distance,
         "length_of_the_path_without_cut_mm": found.missed_mm,
+        "places_where_the_sides_hang_together_mm": found.bridges.tolist(),
         "area_of_the_groove_mm2": wall_area,
         "largest_opening_mm": opening_mm,
     }
@@ -255,8 +269,8 @@ def _page(
         f"Under a tension of {numbers['tension_percent']:g} % it opens by {numbers['largest_opening_mm']:.3g} mm. The points of this "
         "mass-spring model slide on what is beneath; those farther from the cut than it is long, and the rim, stay.",
     ]
-    if found.missed_mm:
-        said.append(f"No cut was found for {found.missed_mm:.3g} mm of the path.")
+    if incomplete := incomplete_text(found, numbers["refined"]):
+        said.insert(0, incomplete)
     if found.repairs:
         said.append(f"Before the cut: {'; '.join(found.repairs)}.")
     if len(triangles) < numbers["triangles"]:
