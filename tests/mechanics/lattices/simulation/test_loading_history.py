@@ -138,7 +138,7 @@ def test_what_cannot_be_run_is_told() -> None:
     floor = still("floor", plane_indenter((0, 0, 0)))
     path = [[0.0, 0, 0, 0], [1.0, 0, 0, -5]]
     for study, words in (
-        (touching(method="euler"), "needs method 'implicit'"),
+        (touching(method="euler"), "needs method 'implicit' or 'symplectic_euler'"),
         (touching(bodies=(floor, moving("ball", ball, path, tied_until_s=1.0))), "floor cannot be in contact"),
         (tied(bodies=(moving("ball", ball, path, tied_until_s=1.0),)), "ball touches no node, the nearest is 3.077"),
         (driven(bodies=(*driven().bodies, moving("ball", spherical_indenter((15.0, 15.0, 60.0), 5.0), path))), "ball cannot move"),
