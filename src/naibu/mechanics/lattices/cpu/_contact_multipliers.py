@@ -47,6 +47,8 @@ def update_multipliers(count, form, surface, history, lists, found, nodal, fract
             for c in range(4):
                 around += covering[k, corners[f, c]] if spread[f, c] > 0.0 else 0.0
             thickness[k, f] = np.sqrt(THINNEST**2 + PER_RADIUS**2 * around / (np.pi * area))
+    if settled:
+        _gather_covered(count, surface, lists, found, nodal, UNDER)
     _gather_fractions(count, surface, lists, found, nodal, fraction, UNDER if settled else TOUCHING)
     for entry in range(0 if settled else count):
         k, f = lists[0][entry], lists[1][entry]
@@ -159,17 +161,14 @@ def _gather_stiffness(count, surface, thickness, lists, found, stiffness):  # ty
 
 
 @njit(cache=True, **UNCOUNTED)
-def _gather_fractions(count, surface, lists, found, nodal, fraction, column):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Find how far nodes are covered: as the least covered one of the faces around them, those hardly touched left out.
-
-    `column` is that of the covered fractions of points; the covered areas and inverse areas of `nodal` are changed.
-    """
+def _gather_covered(count, surface, lists, found, nodal, column):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add up the covered areas around the nodes, and find their inverse areas, with another covered fraction of points."""
     corners, spread, _, shapes, weights, first, rule = surface
     covering, largest = nodal[COVERING], nodal[LARGEST]
     for entry in range(count):
         for c in range(4):
             k, i = lists[0][entry], corners[lists[1][entry], c]
-            fraction[k, i], covering[k, i], largest[k, i] = 1.0, 0.0, 0.0
+            covering[k, i], largest[k, i] = 0.0, 0.0
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
         each = rule[k + 1] - rule[k]
@@ -180,6 +179,19 @@ def _gather_fractions(count, surface, lists, found, nodal, fraction, column):  #
                 covering[k, i] += part
                 if part > 0.0:
                     largest[k, i] = max(largest[k, i], spread[f, c])
+
+
+@njit(cache=True, **UNCOUNTED)
+def _gather_fractions(count, surface, lists, found, nodal, fraction, column):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Find how far nodes are covered: as the least covered one of the faces around them, those hardly touched left out.
+
+    `column` is that of the covered fractions of points, whose covered areas and inverse areas `nodal` holds.
+    """
+    corners, spread, _, _, weights, first, rule = surface
+    covering, largest = nodal[COVERING], nodal[LARGEST]
+    for entry in range(count):
+        for c in range(4):
+            fraction[lists[0][entry], corners[lists[1][entry], c]] = 1.0
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
         each, least = rule[k + 1] - rule[k], 1.0
