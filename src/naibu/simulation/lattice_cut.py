@@ -133,6 +133,7 @@ class LatticeCut:
             touched=carried(before.touched), compression=carried(before.compression), extension=carried(before.extension),
             friction=carried(before.friction), begun=carried(before.begun),
             multiplier=np.ascontiguousarray(before.multiplier[:, self.source]),
+            covered=np.ascontiguousarray(before.covered[:, self.source]),
             acceleration=np.ascontiguousarray(before.acceleration[:, self.source]),
         )  # fmt: skip
 

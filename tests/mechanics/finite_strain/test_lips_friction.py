@@ -245,3 +245,24 @@ def test_in_real_time_the_force_on_a_steep_cut_is_that_of_a_sliding_wedge() -> N
     friction, slope = 0.2, 0.4
     forces, _ = rubbed(RealTimeEngine, friction, slope, [(0.0, -0.5)] * 20)  # slowly, by a quarter of a per cent
     assert abs(forces[-1, 1]) / -forces[-1, 2] == pytest.approx(np.tan(np.arctan(slope) - np.arctan(friction)), rel=0.01)
+
+
+def test_the_way_by_the_balance_without_friction_comes_to_the_same_balance() -> None:
+    """Pressed and sheared in one step from where nothing pressed: by Newton's method, and by way of the frictionless balance."""
+    mesh = inclined(0.0)
+    made = problem(mesh, (0.0, 0.0, 0.0), 0.3).assembler
+    engine, _ = stepped_by(DynamicEngine, made, mesh, 5e-3)
+    low, high = (np.flatnonzero(side) for side in (mesh.points[:, 2] < 1e-9, mesh.points[:, 2] > SIZE - 1e-9))
+    moving = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, -20.0]])
+    with engine.session(constrained=[low, high]) as session:
+        direct = session._balanced(5e-3, moving, ())
+        guess = np.zeros_like(mesh.points)
+        guess[high] = 5e-3 * moving[1]
+        around = session._rubbing(session._implicit_step(5e-3, ()), guess)
+    assert direct is not None and around is not None
+    stepped = engine.assembler.in_step(np.zeros_like(mesh.points))
+    assert isinstance(stepped, LipAssembler) and stepped.lips is not None
+    across, traction = stepped.lips.slip_forces(around)
+    assert across.sum() > 10.0 and np.linalg.norm(traction, axis=1).max() > 0.1
+    np.testing.assert_allclose(stepped.lips.slip_forces(direct)[1], traction, atol=2e-3 * np.abs(traction).max())
+    np.testing.assert_allclose(direct, around, atol=2e-3 * np.abs(direct).max())

@@ -56,3 +56,37 @@ def test_without_a_change_nothing_happens(dense: FloatArray) -> None:
     same = ChangedInverse.of(factors_of(dense).between(np.array([1, 4])), BlockChange(none, none, none, np.zeros((0, 3, 3))))
     np.testing.assert_allclose(same.solve(b), b)
     np.testing.assert_allclose(factors_of(np.diag(np.arange(1.0, 10.0))).solve(np.ones(9)), 1.0 / np.arange(1.0, 10.0))
+
+
+def test_nodes_in_pairs_are_solved_by_their_relative_motion(dense: FloatArray) -> None:
+    """Two pairs that resist relative motion, one of them unsymmetrically, beside a node that is held: half of the unknowns of the pairs."""
+    random = np.random.default_rng(9)
+    some, made = np.array([0, 2, 3, 5, 7, 11]), factors_of(dense)
+    first, second, held = np.array([1, 5]), np.array([3, 0]), 2
+    stiff = random.standard_normal((2, 3, 3)) + 20.0 * np.eye(3)
+    rows = np.concatenate([first, second, first, second, [held]])
+    columns = np.concatenate([first, second, second, first, [held]])
+    blocks = np.concatenate([stiff, stiff, -stiff, -stiff, 30.0 * np.eye(3)[None]])
+    places = np.unique(rows)
+    change = BlockChange(places, places.searchsorted(rows), places.searchsorted(columns), blocks)
+    inverse, whole = made.between(some).astype(float), np.zeros((3 * len(some),) * 2)
+    for r, c, block in zip(rows, columns, blocks, strict=True):
+        whole[3 * r : 3 * r + 3, 3 * c : 3 * c + 3] += block
+    b = random.standard_normal((len(some), 3))
+    changed = ChangedInverse.of(made.between(some), change)
+    expected = np.linalg.solve(np.eye(len(whole)) + inverse @ whole, b.ravel())
+    np.testing.assert_allclose(changed.solve(b).ravel(), expected, atol=1e-4 * np.abs(expected).max())
+    assert len(changed.change.nodes) == 3
+
+
+def test_a_node_that_is_in_a_pair_and_held_besides_counts_by_itself(dense: FloatArray) -> None:
+    some, stiff = np.array([0, 2, 3]), 15.0 * np.eye(3)
+    rows, columns = np.array([0, 1, 0, 1]), np.array([0, 1, 1, 0])
+    change = BlockChange(np.array([0, 2]), rows, columns, np.array([stiff + 5.0, stiff, -stiff, -stiff]))
+    inverse, whole = factors_of(dense).between(some).astype(float), np.zeros((9, 9))
+    for r, c, block in zip(change.nodes[rows], change.nodes[columns], change.blocks, strict=True):
+        whole[3 * r : 3 * r + 3, 3 * c : 3 * c + 3] += block
+    b = np.arange(9.0).reshape(3, 3)
+    expected = np.linalg.solve(np.eye(9) + inverse @ whole, b.ravel())
+    found = ChangedInverse.of(factors_of(dense).between(some), change).solve(b)
+    np.testing.assert_allclose(found.ravel(), expected, atol=1e-4 * np.abs(expected).max())

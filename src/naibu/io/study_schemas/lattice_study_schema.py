@@ -313,8 +313,8 @@ class StudyFile(_Table):
         if tied and self.floor is not None and not sticking:
             raise ValueError(f'[floor] contact = "friction" does not go with {tied[0]}, which is tied; write contact = "sticking"')
         rubbing = bool(touching) or (self.floor is not None and not sticking)
-        if rubbing and self.simulation.method != "implicit":
-            raise ValueError(f'[simulation] method = "{self.simulation.method}": contact by friction needs method = "implicit"')
+        if rubbing and self.simulation.method == "euler":
+            raise ValueError('[simulation] method = "euler": contact by friction needs method = "implicit" or "symplectic_euler"')
         driven = [k for k, p in enumerate(self.indenter) if p.force is not None and p.contact == "friction"]
         if len(driven) > 1:
             raise ValueError(f"{_number(driven[1])} force: one indenter of a study can be moved by force; give the others a path")

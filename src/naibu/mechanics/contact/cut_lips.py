@@ -268,6 +268,39 @@ def _pressed(gap, normal, pairs, area, edge, stiffness, force, blocks):  # type:
     return energy
 
 
+@njit(cache=True, nogil=True)
+def pair_forces(relative, anchors, normals, area, edge, stiffness, mu, force, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set the internal forces (p, 3) of pairs on their first nodes and their stiffnesses (p, 3, 3), with the secant of friction.
+
+    It is what `CutLips.add` finds of pairs that have been given normals, from the positions of the second nodes relative to the first
+    (p, 3), mm, without arrays in between: it is called many times in a step.
+    """
+    count = len(relative)
+    gap, pressing, slope, tangential = np.full(count, np.inf), np.zeros(count), np.zeros(count), np.empty(count)
+    own, both, shift = np.empty((count, 2), np.int64), np.zeros((2 * count, 3)), np.empty((count, 3))
+    blocks[:] = 0.0
+    for p in range(count):
+        own[p, 0], own[p, 1] = 2 * p, 2 * p + 1
+        g, faces = 0.0, False
+        for i in range(3):
+            g += normals[p, i] * relative[p, i]
+            faces = faces or normals[p, i] != 0.0
+            shift[p, i] = relative[p, i] - anchors[p, i]
+        k, ramp = stiffness[p] * area[p], RAMP * edge[p]
+        tangential[p] = TANGENTIAL * k
+        if not faces:
+            continue
+        gap[p], closed = g, min(g, 0.0)
+        pressing[p] = 0.5 * k * closed * closed / ramp if closed > -ramp else -k * (closed + 0.5 * ramp)
+        slope[p] = -g / ramp * k if g > -ramp else k
+    _pressed(gap, normals, own, area, edge, stiffness, both, blocks)
+    if mu > 0.0:
+        _slipped(pressing, slope, normals, own, shift, tangential, mu, True, both, blocks, np.zeros((count, 3)))
+    for p in range(count):
+        for i in range(3):
+            force[p, i] = both[2 * p, i]
+
+
 def _across(gap: FloatArray, area: FloatArray, edge: FloatArray, stiffness: FloatArray) -> FloatArray:
     """Return the forces across the sides (p,), mN, of pairs with these gaps: those of `_pressed`."""
     k, ramp = stiffness * area, RAMP * edge

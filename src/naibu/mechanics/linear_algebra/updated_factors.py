@@ -126,38 +126,104 @@ class UpdatedFactors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChangedInverse:
-    """Solutions d (m, 3) of ``(1 + inverse change) d = b``, with a part of the inverse of a matrix between m nodes."""
+    """Solutions d (m, 3) of ``(1 + inverse change) d = b``, with a part of the inverse of a matrix between m nodes.
+
+    Nodes that a change joins in pairs, as those of the two sides of a cut, count by their relative motion alone: a small matrix of half the
+    size is factorized for them.
+
+    Attributes
+    ----------
+    change : BlockChange
+        Between nodes and relative motions: its nodes are those whose motion counts, less that of the partner where there is one.
+    partner : ndarray, shape (s,), int64
+        The other node of a pair; -1 where a node counts by itself.
+    """
 
     change: BlockChange
-    _rows: IntArray
+    partner: IntArray
     _columns: NDArray[np.float32]
     _factors: tuple[NDArray[np.float32], NDArray[np.int32]]
 
     @classmethod
     def of(cls, inverse: NDArray[np.float32], change: BlockChange) -> ChangedInverse:
         """Factorize for a part of the inverse (3 m, 3 m), in the order of columns; the nodes of the change are places among the m."""
-        at = _rows(change.nodes)
+        change, partner = _by_relative_motion(change)
+        at, paired = _rows(change.nodes), np.flatnonzero(np.repeat(partner >= 0, 3))
         columns = inverse.T.take(at, axis=0).T  # contiguous both here and there: three times as fast as indices of columns
+        between = columns.T.take(at, axis=1).T
+        if len(paired):
+            other = _rows(partner[partner >= 0])
+            columns[:, paired] -= inverse.T.take(other, axis=0).T
+            between = columns.T.take(at, axis=1).T
+            between[paired] -= columns.T.take(other, axis=1).T
         matrix = np.asfortranarray(np.eye(len(at), dtype=np.float32))
-        _add_product(columns.T.take(at, axis=1).T, change.rows, change.columns, change.blocks, matrix)
+        _add_product(between, change.rows, change.columns, change.blocks, matrix)
         factors = la.lu_factor(matrix, overwrite_a=True, check_finite=False) if len(at) else (matrix, np.zeros(0, np.int32))
-        return cls(change, at, columns, factors)
+        return cls(change, partner, columns, factors)
 
     def solve(self, b: FloatArray) -> FloatArray:
         """Return d (m, 3) for b (m, 3)."""
-        nodes = self.change.nodes
+        nodes, partner = self.change.nodes, self.partner
         if len(nodes) == 0:
             return b
-        there = la.lu_solve(self._factors, b[nodes].astype(np.float32).ravel(), check_finite=False).astype(np.float64).reshape(-1, 3)
+        both = np.flatnonzero(partner >= 0)
+        right = b[nodes]
+        right[both] -= b[partner[both]]
+        there = la.lu_solve(self._factors, right.astype(np.float32).ravel(), check_finite=False).astype(np.float64).reshape(-1, 3)
         reaction = np.zeros((len(nodes), 3))
         np.add.at(reaction, self.change.rows, np.einsum("bij,bj->bi", self.change.blocks, there[self.change.columns]))
         out = b - (self._columns @ reaction.ravel().astype(np.float32)).reshape(-1, 3)
-        out[nodes] = there
+        alone = partner < 0
+        out[nodes[alone]] = there[alone]
+        wrong = 0.5 * (there[both] - (out[nodes[both]] - out[partner[both]]))
+        out[nodes[both]] += wrong
+        out[partner[both]] -= wrong
         return np.asarray(out)
+
+
+def _by_relative_motion(change: BlockChange) -> tuple[BlockChange, IntArray]:
+    """Return a change with one place for every pair of nodes that resists nothing but its relative motion, and the partners (s,)."""
+    count = len(change.nodes)
+    other = _partners(count, change.rows, change.columns, change.blocks)
+    kept = np.flatnonzero((other < 0) | (other > np.arange(count)))
+    if len(kept) == count:
+        return change, np.full(count, -1, dtype=np.int64)
+    place = np.full(count, -1, dtype=np.int64)
+    place[kept] = np.arange(len(kept))
+    some = (place[change.rows] >= 0) & (place[change.columns] >= 0)
+    partner = np.where(other[kept] >= 0, change.nodes[other[kept]], -1)
+    return BlockChange(change.nodes[kept], place[change.rows[some]], place[change.columns[some]], change.blocks[some]), partner
 
 
 def _rows(nodes: IntArray) -> IntArray:
     return np.asarray((3 * nodes[:, None] + np.arange(3)).ravel())
+
+
+@njit(cache=True, nogil=True)
+def _partners(count, rows, columns, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the other node of pairs whose blocks are K, -K, -K and K, and touch no other node; -1 of all others."""
+    entries, own, across, other = np.zeros(count, np.int64), np.full(count, -1), np.full(count, -1), np.full(count, -1)
+    for b in range(len(rows)):
+        i = rows[b]
+        entries[i] += 1
+        if columns[b] == i:
+            own[i] = b
+        else:
+            across[i] = b
+    for i in range(count):
+        if entries[i] != 2 or own[i] < 0 or across[i] < 0:
+            continue
+        j = columns[across[i]]
+        if entries[j] != 2 or own[j] < 0 or across[j] < 0 or columns[across[j]] != i:
+            continue
+        same = True
+        for a in range(3):
+            for c in range(3):
+                k = blocks[own[i], a, c]
+                same = same and blocks[across[i], a, c] == -k and blocks[across[j], a, c] == -k and blocks[own[j], a, c] == k
+        if same:
+            other[i] = j
+    return other
 
 
 @njit(cache=True, nogil=True, fastmath=True)

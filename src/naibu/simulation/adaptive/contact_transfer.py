@@ -42,7 +42,7 @@ def transferred_contact(
     first = np.cumsum([0, *(len(s) for s in sources)]).astype(np.int64)
     held = ("mode", "touched", "compression", "extension", "friction", "begun")
     return replace(
-        contact, order=order, first=first, multiplier=np.ascontiguousarray(multiplier),
+        contact, order=order, first=first, multiplier=np.ascontiguousarray(multiplier), covered=np.zeros(np.shape(multiplier)),
         thickness=_transferred_thickness(contact.thickness, before, after),
         acceleration=np.zeros((3, len(after.points))), lasting=np.zeros(1),
         **{name: getattr(contact, name)[source] for name in held},

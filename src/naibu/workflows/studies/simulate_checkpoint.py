@@ -97,6 +97,7 @@ def _packed(state: StudyState, fingerprint: str, series: str) -> bytes:
 def _unpacked(data: dict[str, Any]) -> StudyState:
     contact = None
     if "contact_mode" in data:
+        data.setdefault("contact_covered", np.zeros_like(data["contact_multiplier"]))  # files of earlier versions lack it
         contact = ContactState(*(data[f"contact_{name}"] for name in CONTACT_ARRAYS))
     lattice = LatticeState(data["position"], data["velocity"], data["extension"], data.get("length"), contact)
     speed, external_work, unsettled = data["numbers"].tolist()

@@ -138,7 +138,7 @@ def test_what_cannot_be_run_is_told() -> None:
     floor = still("floor", plane_indenter((0, 0, 0)))
     path = [[0.0, 0, 0, 0], [1.0, 0, 0, -5]]
     for study, words in (
-        (touching(method="euler"), "needs method 'implicit'"),
+        (touching(method="euler"), "needs method 'implicit' or 'symplectic_euler'"),
         (touching(bodies=(floor, moving("ball", ball, path, tied_until_s=1.0))), "floor cannot be in contact"),
         (tied(bodies=(moving("ball", ball, path, tied_until_s=1.0),)), "ball touches no node, the nearest is 3.077"),
         (driven(bodies=(*driven().bodies, moving("ball", spherical_indenter((15.0, 15.0, 60.0), 5.0), path))), "ball cannot move"),
@@ -146,3 +146,14 @@ def test_what_cannot_be_run_is_told() -> None:
     ):
         with pytest.raises(InputError, match=words):
             next(run_study(study))
+
+
+def test_a_study_in_contact_goes_the_same_way_in_short_explicit_and_implicit_steps() -> None:
+    """The ball comes down on the block, with friction, and goes up again: both methods, at steps so short that they agree."""
+    steps = {"step_s": 1e-4, "frames": 3, "samples": 2, "sample_steps": 250, "parameters": SLIGHT}
+    found = [list(run_study(touching(method=method, **steps))) for method in ("implicit", "symplectic_euler")]
+    forces = np.array([[frame.force for frame in run[1:]] for run in found])
+    assert np.abs(forces[0][..., 2]).max() > 10.0
+    np.testing.assert_allclose(forces[1], forces[0], atol=0.02 * np.abs(forces[0]).max())
+    ends = [run[-1].state.lattice.position for run in found]
+    np.testing.assert_allclose(ends[1], ends[0], atol=0.02)

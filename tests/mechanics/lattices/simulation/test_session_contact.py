@@ -209,7 +209,7 @@ FORCE = IndenterForce(1.0, (0, 0, 1), 0.1)
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: engine(method="euler", step=1e-5).session(indenters=[BALL]), "contact needs method='implicit'"),
+        (lambda: engine(method="euler", step=1e-5).session(indenters=[BALL]), "contact needs method='implicit' or 'symplectic_euler'"),
         (lambda: engine().session(indenters=INSIDE), "indenters[0], a sphere, begins inside the object"),
         (lambda: engine().session(indenters=[FLOOR, BALL]).step(motions=[DOWN]), "motions has 1 entries for 2 indenters"),
         (lambda: engine().session(indenters=[FLOOR, BALL]).step(motions=[FORCE, FORCE]), "one indenter can be driven by a force"),

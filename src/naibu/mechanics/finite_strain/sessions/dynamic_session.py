@@ -24,7 +24,7 @@ from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotio
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_strain.lip_assembly import lips_of
+from naibu.mechanics.finite_strain.lip_assembly import lips_of, with_friction, with_secant
 from naibu.mechanics.finite_strain.penalties import node_shear_moduli, relative_penetrations, stiff_enough, with_less_penetration
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
@@ -35,6 +35,7 @@ from naibu.mechanics.linear_algebra.recycled_factors import NEWTON_TOLERANCE, Re
 SUBDIVISIONS = 5  # of a step that does not converge: halves, quarters, ...
 PENETRATION = 0.01  # of the edge of a face, to which the penalties limit how deep indenters go into it, as in statics
 MOST_RAISES = 6  # of the penalties in a step
+RUBBING_ITERATIONS = 40  # of Newton's method without friction, and with its secant, which converges slowly
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,11 +252,28 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
             target = np.where(self._constrained, start.displacement, guess)
             for nodes, speed in zip(self.bodies, moving, strict=True):
                 target[nodes] = start.displacement[nodes] + h * speed
-            try:
-                return step.solved(target, self._solved)
-            except ConvergenceError:
-                continue
+            found = self._found(step, target)
+            if found is None and step.assembler.unsymmetric:
+                found = self._rubbing(step, target)
+            if found is not None:
+                return found
         return None
+
+    def _found(self, step: ImplicitStep, guess: FloatArray) -> FloatArray | None:
+        try:
+            return step.solved(guess, self._solved)
+        except ConvergenceError:
+            return None
+
+    def _rubbing(self, step: ImplicitStep, guess: FloatArray) -> FloatArray | None:
+        """Return the balance of a step whose sides of cuts rub, by way of the one without friction, whose pressures are nearly its own.
+
+        Newton's method fails where many pairs close, and begin to slip, at once: when a loaded body is cut, none of them presses yet.
+        """
+        smooth = replace(step, assembler=with_friction(step.assembler, 0.0), iterations=RUBBING_ITERATIONS)
+        symmetric = replace(step, assembler=with_secant(step.assembler, self.reached.lips), iterations=RUBBING_ITERATIONS)
+        found = self._found(smooth, guess)
+        return None if found is None else self._found(symmetric, found)
 
     def _implicit_step(self, h: float, contacts: tuple[Contact, ...]) -> ImplicitStep:
         engine, start = self.engine, self.reached

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
-from naibu.mechanics.contact.cut_lips import TANGENTIAL, CutLips
+from naibu.mechanics.contact.cut_lips import TANGENTIAL, CutLips, pair_forces
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
@@ -43,22 +43,32 @@ class LipsBesideTangent:
     displacement: FloatArray
     earlier: FloatArray
     _now: FloatArray = field(init=False)
-    _before: FloatArray = field(init=False)
+    _before: FloatArray = field(init=False)  # internal forces on the first nodes (k, 3), mN
+    _begun: FloatArray = field(init=False)  # positions of the second nodes relative to the first (k, 3), mm
+    _anchors: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
-        self._before = np.zeros_like(self.displacement)
-        self._now = self.lips.add(self.displacement, self._before, secant=True)[1]
+        self._before, self._now = np.zeros((len(self.points), 3)), np.zeros((len(self.points), 3, 3))
+        first, second = self.lips.pairs.T
+        at_rest = self.lips.points[second] - self.lips.points[first]
+        self._anchors = at_rest if self.lips.anchors is None else self.lips.anchors
+        self._begun = at_rest + (self.displacement[second] - self.displacement[first])
+        self._evaluate(self._begun, self._before)
+
+    def _evaluate(self, relative: FloatArray, force: FloatArray) -> None:
+        own = self.lips
+        assert own.normals is not None
+        pair_forces(relative, self._anchors, own.normals, own.area, own.edge, own.stiffness, own.friction, force, self._now)
 
     def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the change of the forces up to a displacement (n, 3), mm, to `force` (n, 3), mN."""
         first, second = self.lips.pairs.T
-        internal = -self._before
-        self._now = self.lips.add(displacement, internal, secant=True)[1]
-        motion = displacement - self.displacement
-        known = np.einsum("pij,pj->pi", self.earlier, motion[first] - motion[second])
-        np.add.at(internal, first, -known)
-        np.add.at(internal, second, known)
-        force -= internal
+        moved = displacement[second] - displacement[first] - (self.displacement[second] - self.displacement[first])
+        change = np.empty_like(self._before)
+        self._evaluate(self._begun + moved, change)
+        change += np.einsum("pij,pj->pi", self.earlier, moved) - self._before
+        np.subtract.at(force, first, change)
+        np.add.at(force, second, change)
 
     def touching(self) -> LipsBesideTangent:
         """Return the pairs whose stiffness may differ: all of them."""

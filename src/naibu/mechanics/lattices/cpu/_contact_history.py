@@ -1,4 +1,4 @@
-"""What a step of contact leaves behind: pull-off, the compression of foundations, multipliers of the nodes, friction, and reactions."""
+"""What a step of contact leaves behind: pull-off, the compression of foundations, friction, and reactions."""
 
 from __future__ import annotations
 
@@ -7,11 +7,8 @@ import numpy as np
 from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import mesh_of
 from naibu.mechanics.lattices.cpu._contact_points import ALONG, FORCE, FREE, HARD, OWN, SLIDE, STICK, TANGENT, TOUCHING, gap_of
-from naibu.mechanics.lattices.model.contact_surface import PER_RADIUS, SHARED, THINNEST
 
 GONE = 1e-9  # compression of a foundation that counts as none, mm
-EARNEST = 0.25  # covered fraction of a face that counts
-BARELY, NEARLY = 0.4, 0.9  # covered fractions around a node between which it begins to carry pressure without the foundation
 
 
 @njit(cache=True)
@@ -90,63 +87,6 @@ def keep(count, indenters, surface, history, lists, slid, found, reaction):  # t
                 compression[p], extension[p] = 0.0, 0.0
             left |= found[p, TOUCHING] > 0.0 or compression[p] != 0.0 or (touched[p] and pull[k, 2] > 0.0)
         lists[4][k, f] = left
-
-
-@njit(cache=True, **UNCOUNTED)
-def update_multipliers(count, form, surface, history, lists, found, nodal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Give the nodes what the foundation carries besides their multipliers, as far as the area around them is covered.
-
-    Under round indenters nodes of faces carry the fraction `SHARED` of the pressure in any case, and the thickness of the foundations
-    follows from the area that is covered around them. `nodal` (4, k, n) is scratch.
-    """
-    corners, spread, _, shapes, weights, first, rule = surface
-    multiplier, thickness = history[5], history[6]
-    gain, covering, largest, fraction = nodal[0], nodal[1], nodal[2], nodal[3]
-    for entry in range(count):
-        for c in range(4):
-            k, i = lists[0][entry], corners[lists[1][entry], c]
-            gain[k, i], covering[k, i], largest[k, i], fraction[k, i] = 0.0, 0.0, 0.0, 1.0
-    for entry in range(count):
-        k, f = lists[0][entry], lists[1][entry]
-        each = rule[k + 1] - rule[k]
-        for g in range(each):
-            p, shape = first[k] + f * each + g, shapes[rule[k] + g]
-            if found[p, TOUCHING] == 0.0:
-                continue
-            for c in range(4):
-                i, part = corners[f, c], weights[p] * shape[c]
-                gain[k, i] += part * found[p, OWN]
-                covering[k, i] += part * found[p, TOUCHING]
-                if part > 0.0:
-                    largest[k, i] = max(largest[k, i], spread[f, c])
-    for entry in range(count):  # a node is covered as the least covered one of the faces around it, those hardly touched left out
-        k, f = lists[0][entry], lists[1][entry]
-        each, least = rule[k + 1] - rule[k], 1.0
-        for c in range(4):
-            if spread[f, c] > 0.0:
-                least = min(least, covering[k, corners[f, c]] * largest[k, corners[f, c]])
-        touching, area = 0.0, 0.0
-        for g in range(each):
-            p = first[k] + f * each + g
-            touching, area = touching + weights[p] * found[p, TOUCHING], area + weights[p]
-        if form[k, 0] > 0.0 and spread[f, 1] > 0.0:
-            around = 0.0
-            for c in range(4):
-                around += covering[k, corners[f, c]] if spread[f, c] > 0.0 else 0.0
-            thickness[k, f] = np.sqrt(THINNEST**2 + PER_RADIUS**2 * around / (np.pi * area))
-        earnest = min(touching / (EARNEST * area), 1.0)
-        for c in range(4):
-            i = corners[f, c]
-            own = min(covering[k, i] * largest[k, i], earnest * least + 1.0 - earnest)
-            fraction[k, i] = min(fraction[k, i], own)
-    for entry in range(count):
-        for c in range(4):
-            k, i = lists[0][entry], corners[lists[1][entry], c]
-            if largest[k, i] >= 0.0:
-                share = SHARED if form[k, 0] > 0.0 and spread[lists[1][entry], 1] > 0.0 else 0.0
-                kept = share + (1.0 - share) * min(max((fraction[k, i] - BARELY) / (NEARLY - BARELY), 0.0), 1.0) ** 2
-                multiplier[k, i] = max(kept * (multiplier[k, i] + largest[k, i] * gain[k, i]), 0.0)
-                largest[k, i] = -1.0
 
 
 @njit(cache=True, **UNCOUNTED)

@@ -11,7 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off, update_multipliers
+from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off
+from naibu.mechanics.lattices.cpu._contact_multipliers import settle_multipliers, update_multipliers
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, close_operator
 from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces, new_room
 from naibu.mechanics.lattices.cpu._contact_solver import (
@@ -60,7 +61,7 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
     data, (tolerance, limit) = engine
     v, (_, r, _, _), inner = data[0][3], data[0][4], data[0][5]
     x, step = data[1][0], data[1][6]
-    count, indenters, motion, surface, history, lists, slid, points, slot, diagonal, room = contact
+    count, indenters, motion, surface, history, lists, slid, points, slot, diagonal, room, (nodal, covered, together) = contact
     given, plain, origin = vectors
     operator = inner[OPERATOR]
     strict = 1.0 if tolerance >= LOOSE else STRICT
@@ -88,6 +89,9 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
         if attempt > 0 and not ended_before:  # what begins to slip is not decided by a rough solution
             _slid_before(count, surface, history, lists, slid)
         begins, ended_before = attempt < 0, ended
+        if together and not begins:
+            inertia = (data[0][2], step)
+            settle_multipliers(count, v, indenters[4], surface, history, lists, points, nodal, covered, inertia, room[2][1], attempt == 0)
         wrong, wrong_friction, total, limits = look(
             count, x, v, step, indenters, motion, surface, history, lists, slid, points, begins, room
         )
@@ -137,18 +141,19 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
     shapes (geometry, axes), centres (k, 3), friction (k, 2), pull-off (k, 3), curvature and depth from which the foundation is stiffer
     (k, 2) of the indenters; nodes of the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions (q, 4) and weights (p,)
     at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of `ContactState`; what
-    `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal blocks, four numbers a
-    node (4, k, n), the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are changed; and room for four
-    vectors (3 pad,). Constrained components of `data` move by their weights times the velocities of their bodies; `motion` are these
-    (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the limits of the solver;
-    `reactions` those of the bodies and of the indenters; `most` the most passes.
+    `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal blocks, numbers of the
+    nodes (COLUMNS, k, n), how far they are covered (k, n), whether multipliers are found with the end of the step, the mean acceleration in
+    the step before (3, n) and how much of it lasted (1,), which are changed; and room for four vectors (3 pad,). Constrained
+    components of `data` move by their weights times the velocities of their bodies; `motion` are these (steps, bodies, 3), and velocities
+    and angular velocities of the indenters (steps, k, 3); `solver` the limits of the solver; `reactions` those of the bodies and of the
+    indenters; `most` the most passes.
     Returns iterations, passes and the steps whose contacts did not settle.
     """
     (_, _, mass, v, work, inner, now), (x, _, _, before, base, external, step) = data
     indenters, surface, history, scratch, (change, given, plain, origin) = contact
     (_, axes), centres, _, _, _ = indenters
     held_velocity, velocity, spin = motion
-    lists, points, slid, slot, diagonal, nodal, trend, trust = scratch
+    lists, points, slid, slot, diagonal, nodal, covered, together, trend, trust = scratch
     operator, first = inner[OPERATOR], surface[5]
     change[:], given[:] = 0.0, 0.0
     pad = len(mass)
@@ -168,7 +173,7 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
         pull_off(count, x, v, step, mass, indenters, moving, surface, history, lists, base, reactions[1][n])
         add_momenta(mass, v, 1.0, base)
         _slid_before(count, surface, history, lists, slid)
-        found = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal, room)
+        found = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal, room, (nodal, covered, together))
         for a in range(3):
             for i in range(trend.shape[1]):
                 change[a * pad + i] = step * trend[a, i]
@@ -181,7 +186,7 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
         iterations, passes, unsettled = iterations + done, passes + tries, unsettled + (not agreed)
         add_reactions(now, work[1], len(mass), step, reactions[0][n])
         keep(count, indenters, surface, history, lists, slid, points[1], reactions[1][n])
-        update_multipliers(count, indenters[4], surface, history, lists, points[1], nodal)
+        update_multipliers(count, indenters[4], surface, history, lists, points[1], nodal, covered, together)
         advance(data, lost)
     operator[5][FACES], operator[5][NODES] = 0, 0
     return iterations, passes, unsettled

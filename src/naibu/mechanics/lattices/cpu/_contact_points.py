@@ -24,12 +24,14 @@ MARGIN = 0.25  # of the radius of a face, by which it may be off what was forese
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
 LEAST_SLOPE = 1e-3  # of a gap over a cell
+NEAR = 0.1  # of the width of a cell that looks at a flat indenter: it has what is as near as that
 UPRIGHT = 0.75  # width of the cells of a face that stands upright on an indenter: Gauss points lie nearer to its edge than they are wide
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
 # velocity of the indenter, fraction of the cell that is covered
 NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, COLUMNS = 0, 3, 4, 7, 8, 9, 12, 13
-# columns of what it exerts: force, friction, pressure, covered fraction, pressure besides the multiplier
-FORCE, TANGENT, ALONG, TOUCHING, OWN, RESULTS = 0, 3, 6, 7, 8, 9
+# columns of what it exerts: force, friction, pressure, covered fraction, pressure besides the multiplier, fraction that a flat indenter
+# has near
+FORCE, TANGENT, ALONG, TOUCHING, OWN, UNDER, RESULTS = 0, 3, 6, 7, 8, 9, 10
 
 
 @njit(cache=True)
@@ -177,14 +179,17 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
                 if found[p, TOUCHING] != 0.0:
                     found[p] = 0.0
                 if _is_far(gap, np.sqrt(weight), form[k, 0]):
+                    found[p, UNDER] = 0.0
                     continue
             own, result = linear[p], found[p]
             _combine(shape, speed, slip)
-            _exerted(own, slip, result)
+            exerted(own, slip, result)
             slope = _slope(n, across)
             carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
             _towards_face(n, across)
             depth, covered, growth = _covered(-gap, slope, np.sqrt(weight), form[k, 0])
+            if form[k, 0] == 0.0:
+                found[p, UNDER] = _covered(NEAR * (1.0 - slope) * np.sqrt(weight) - gap, slope, np.sqrt(weight), 0.0)[1]
             hard = HARD * stiff if covered > 0.0 and depth > form[k, 1] else 0.0
             own_pressure = stiff * (depth - compression[p]) + spring * extension[p] + covered * carried
             pressure = own_pressure + hard * max(depth - form[k, 1], 0.0) if covered > 0.0 else 0.0
@@ -310,7 +315,7 @@ def _open(own, n, motion, k, d, slip):  # type: ignore[no-untyped-def]  # pragma
 
 
 @njit(cache=True)
-def _exerted(own, slip, result):  # type: ignore[no-untyped-def]  # pragma: no cover
+def exerted(own, slip, result):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set what a linearized point exerts while it moves with the velocity `slip`; nothing, as before, where it is not in contact."""
     if own[ACTIVE] == 0.0:
         return

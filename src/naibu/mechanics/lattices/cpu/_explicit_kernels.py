@@ -42,6 +42,16 @@ def element_forces(first, second, rows, tables, x, v, y, f, pad, begin, end):  #
         store(f2, i, load(f2, i) + fz)
 
 
+@njit(cache=True, fastmath=_FAST, nogil=True, **UNCOUNTED)
+def forces_of_elements(blocks, tables, state, external, f):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set f (3 pad,) to what all elements and external forces exert, and move the extensions on; state are x, v and y."""
+    x, v, y = state
+    f[:] = 0
+    for place in range(len(external)):
+        f[place] = external[place]
+    element_forces(blocks[0], blocks[1], blocks[2], tables, x, v, y, f, len(x) // 3, 0, len(blocks[0]))
+
+
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def drive(constrained, velocity, v, f, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Change the forces on constrained nodes so that they take on the velocity of their bodies (bodies, 3), mm/s, along the directions.

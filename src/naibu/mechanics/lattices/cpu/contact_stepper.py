@@ -1,4 +1,4 @@
-"""Implicit steps of a lattice in contact with rigid indenters: stored state, indenters and the history of their contacts."""
+"""Steps of a lattice in contact with rigid indenters: stored state, indenters and the history of their contacts."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geo
 from naibu.mechanics.contact.indenter_motion import SHARE, step_parts
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.lattices.cpu._contact_kernels import contact_steps
+from naibu.mechanics.lattices.cpu._contact_multipliers import COLUMNS
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
-from naibu.mechanics.lattices.cpu._contact_points import COLUMNS, RESULTS, rest_at
+from naibu.mechanics.lattices.cpu._contact_points import COLUMNS as POINT_COLUMNS
+from naibu.mechanics.lattices.cpu._contact_points import RESULTS, rest_at
+from naibu.mechanics.lattices.cpu.explicit_contact import ElementForces
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import POOL
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments
 from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitStepper
@@ -32,7 +35,7 @@ DEEP, ROUND = (
 
 @dataclass(slots=True, eq=False)
 class ContactStepper:
-    """An implicit stepper with indenters.
+    """A stepper with indenters.
 
     Attributes
     ----------
@@ -56,6 +59,8 @@ class ContactStepper:
         As they were made.
     divided : callable
         Returns a stepper of the same arrays whose steps are shorter by a whole number.
+    forces : ElementForces
+        Of the elements, where these are stepped explicitly; `base` then has the masses alone.
     points : tuple
         Nodes of the faces, inverse areas, shape functions and weights, and where those of each indenter begin.
     scratch : tuple
@@ -74,6 +79,7 @@ class ContactStepper:
     divided: Callable[[ImplicitStepper, int], ImplicitStepper]
     points: KernelTuple
     scratch: KernelTuple
+    forces: ElementForces | None = None
     _fastest: FloatArray = field(init=False)  # (k,), mm/s, at which no indenter passes through the surface in a step
     _finer: dict[int, ImplicitStepper] = field(default_factory=dict)
     _arguments: dict[int, tuple[KernelTuple, PackedArguments, PackedArguments]] = field(default_factory=dict)
@@ -84,7 +90,7 @@ class ContactStepper:
     @classmethod
     def of(
         cls, base: ImplicitStepper, indenters: Sequence[RigidIndenter], contact: ContactState, surface: ContactSurface,
-        divided: Callable[[ImplicitStepper, int], ImplicitStepper], passes: int = PASSES,
+        divided: Callable[[ImplicitStepper, int], ImplicitStepper], passes: int = PASSES, forces: ElementForces | None = None,
     ) -> ContactStepper:  # fmt: skip
         """Put indenters beside a lattice; the contact state is copied."""
         friction = np.array([(p.static_friction, p.kinetic_friction) for p in indenters])
@@ -93,7 +99,7 @@ class ContactStepper:
         geometry, own = packed_geometries([p.geometry for p in indenters]), contact.copied()
         points = _points(surface, own)
         scratch = _scratch(len(surface.faces), len(indenters), len(own.mode), len(base.mass))
-        stepper = cls(base, own, surface, geometry, friction, pull, form, passes, tuple(indenters), divided, points, scratch)
+        stepper = cls(base, own, surface, geometry, friction, pull, form, passes, tuple(indenters), divided, points, scratch, forces)
         if not own.begun.all():
             corners, spread, *rest = points
             faces = (corners, spread, surface.foundation(base.step), *rest)
@@ -157,8 +163,16 @@ class ContactStepper:
             values[:] = 0.0
         data, own = self._arguments_of(base, parts)
         motion, limits = (held_velocity, velocity, spin), (base.tolerance, MOST_ITERATIONS)
-        found: tuple[int, int, int] = contact_steps(data, own, base.constrained[2], motion, limits, reactions, self.passes)
-        return found
+        if self.forces is None:
+            found: tuple[int, int, int] = contact_steps(data, own, base.constrained[2], motion, limits, reactions, self.passes)
+            return found
+        total = np.zeros(3, dtype=np.int64)
+        for n in range(len(velocity)):
+            row = slice(n, n + 1)
+            self.forces.begin_step(parts)
+            step, exerted = tuple(values[row] for values in motion), tuple(values[row] for values in reactions)
+            total += contact_steps(data, own, base.constrained[2], step, limits, exerted, self.passes)
+        return int(total[0]), int(total[1]), int(total[2])
 
     def _arguments_of(self, base: ImplicitStepper, parts: int) -> tuple[PackedArguments, PackedArguments]:
         """Return what the kernels read of a stepper that shares the state, and of the contact."""
@@ -170,7 +184,8 @@ class ContactStepper:
             corners, spread, *rest = self.points
             surface = (corners, spread, self.surface.foundation(base.step), *rest)
             vectors = tuple(np.zeros_like(base.position) for _ in range(4))
-            scratch = (*own, contact.acceleration, contact.lasting)
+            together = not self.surface.resists_at_once(base.step, base.mass)
+            scratch = (*own, contact.covered, together, contact.acceleration, contact.lasting)
             known = base.constrained, data, packed(self._shapes(), surface, history, scratch, vectors)
             self._arguments[parts] = known
         return known[1], known[2]
@@ -200,8 +215,9 @@ class ContactStepper:
     def _changing(self) -> tuple[AnyArray, ...]:
         base, contact = self.base, self.contact
         assert base.length is not None  # as of all implicit steps
-        lattice = (base.position, base.velocity, base.extension, base.length)
-        return (*lattice, *contact.history(), contact.centres, contact.axes, contact.acceleration, contact.lasting)
+        extension = base.extension if self.forces is None else self.forces.stepper.extension
+        lattice = (base.position, base.velocity, extension, base.length)
+        return (*lattice, *contact.history(), contact.centres, contact.axes, contact.covered, contact.acceleration, contact.lasting)
 
 
 def _points(surface: ContactSurface, contact: ContactState) -> KernelTuple:
@@ -220,10 +236,10 @@ def _scratch(faces: int, indenters: int, points: int, pad: int) -> KernelTuple:
         np.zeros(pairs, np.int64), np.zeros(pairs, np.int64), np.zeros((indenters, faces)), np.zeros(indenters),
         np.zeros((indenters, faces), np.bool_),
     )  # fmt: skip
-    exerted = (np.zeros((points, COLUMNS)), np.zeros((points, RESULTS)))
+    exerted = (np.zeros((points, POINT_COLUMNS)), np.zeros((points, RESULTS)))
     slots = min(4 * faces, pad)
     operator = new_operator(pairs, slots)
-    nodal = (np.full(pad, -1, np.int64), np.zeros((slots, 3, 3)), np.zeros((4, indenters, pad)))
+    nodal = (np.full(pad, -1, np.int64), np.zeros((slots, 3, 3)), np.zeros((COLUMNS, indenters, pad)))
     return operator, lists, exerted, np.zeros(points, np.bool_), *nodal
 
 

@@ -15,10 +15,13 @@ from naibu._numba.thread_pool import MOST_PARTS
 from naibu.core.arrays import AnyFloatArray, FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.lattices.cpu.contact_stepper import PASSES, ContactStepper
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel, implicit_kernel
+from naibu.mechanics.lattices.cpu.explicit_contact import element_forces_of
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch, ScratchPool
 from naibu.mechanics.lattices.cpu.session import LatticeSession
 from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitStepper, Stepper
+from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
 from naibu.mechanics.lattices.model.state import (
@@ -151,7 +154,7 @@ class LatticeEngine:
         ------
         InputError
             Shapes that do not fit, NaN, constrained nodes that are not there, an indenter inside the object, other indenters than those of
-            the state, or contact by an explicit method.
+            the state, or contact by ``"euler"`` or in single precision.
         """
         return LatticeSession.of(self, state, constrained, external_force, indenters)
 
@@ -225,6 +228,31 @@ class LatticeEngine:
         if not self._surface:
             self._surface.append(ContactSurface.of(self.lattice, self.parameters))
         return self._surface[0]
+
+    def in_contact(
+        self, stepper: Stepper, indenters: Sequence[RigidIndenter], contact: ContactState, passes: int = PASSES
+    ) -> ContactStepper:
+        """Return what takes the steps of a stepper with indenters beside the lattice; the contact state is copied.
+
+        Raises
+        ------
+        InputError
+            Explicit steps that move nodes by the velocity before them, or single precision.
+        """
+        if isinstance(stepper, ImplicitStepper):
+            return ContactStepper.of(stepper, indenters, contact, self.surface(), self.divided, passes)
+        assert isinstance(stepper, ExplicitStepper)
+        if self.method == "euler":
+            raise InputError(
+                "contact needs method='implicit' or 'symplectic_euler', which move nodes by the velocity with which they stop at an "
+                "indenter, not 'euler'"
+            )
+        if self.mass.dtype != np.float64:
+            raise InputError("contact needs precision='double', not 'single'")
+        forces = element_forces_of(stepper, self.parameters, self.blocks)
+        masses = forces.masses(1)
+        masses.constrain(stepper.constrained, stepper.bodies)
+        return ContactStepper.of(masses, indenters, contact, self.surface(), lambda _, parts: forces.masses(parts), passes, forces)
 
     def divided(self, stepper: ImplicitStepper, parts: int) -> ImplicitStepper:
         """Return a stepper of the same arrays whose steps are shorter by a whole number."""

@@ -18,8 +18,8 @@ from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotio
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.lattices.cpu.contact_stepper import ContactStepper, DrivenIndenter
-from naibu.mechanics.lattices.cpu.stepper import ImplicitStepper, Stepper
-from naibu.mechanics.lattices.model.contact_state import begin_contact
+from naibu.mechanics.lattices.cpu.stepper import Stepper
+from naibu.mechanics.lattices.model.contact_state import ContactState, begin_contact
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, Method, checked_velocity, require_constrained
@@ -58,8 +58,8 @@ class SteppedEngine(Protocol):
     def surface(self) -> ContactSurface:
         """Return the faces that indenters may touch."""
 
-    def divided(self, stepper: ImplicitStepper, parts: int) -> ImplicitStepper:
-        """Return a stepper of the same arrays whose steps are shorter by a whole number."""
+    def in_contact(self, stepper: Stepper, indenters: Sequence[RigidIndenter], contact: ContactState) -> ContactStepper:
+        """Return what takes the steps of a stepper with indenters beside the lattice."""
 
 
 @dataclass(slots=True, eq=False, weakref_slot=True)
@@ -159,7 +159,10 @@ class LatticeSession:
         self.bodies = max(int(constrained.body.max(initial=-1)) + 1, bodies)
         self.constrained = constrained
         self._path = np.zeros((0, self.bodies, 3))
-        self.stepper.constrain((constrained.node, constrained.direction, constrained.weight, constrained.body), self.bodies)
+        entries = (constrained.node, constrained.direction, constrained.weight, constrained.body)
+        self.stepper.constrain(entries, self.bodies)
+        if self._contact is not None and self._contact.base is not self.stepper:
+            self._contact.base.constrain(entries, self.bodies)
         self.stepper.advance(self._path, np.zeros((0, self.bodies, 3)))  # compiles what is to run, and builds what belongs to these nodes
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
@@ -170,7 +173,7 @@ class LatticeSession:
         Raises
         ------
         InputError
-            An explicit method, or a new indenter inside the object.
+            Contact by ``"euler"`` or in single precision, or a new indenter inside the object.
         """
         if self._contact is not None:
             where = self._contact.contact.centres
@@ -286,11 +289,9 @@ class LatticeSession:
 
     def _bring(self, indenters: Sequence[RigidIndenter], state: LatticeState | None, resting: Sequence[RigidIndenter] = ()) -> None:
         lattice, stepper = self.engine.lattice, self.stepper
-        if not isinstance(stepper, ImplicitStepper):
-            raise InputError(f"contact needs method='implicit', which is stable when nodes stop at an indenter, not {self.engine.method!r}")
         known, surface = None if state is None else state.contact, self.engine.surface()
         known = known or begin_contact(lattice, surface, indenters, self.positions(), resting)
-        self._contact = ContactStepper.of(stepper, indenters, known, surface, self.engine.divided)
+        self._contact = self.engine.in_contact(stepper, indenters, known)
         self.indenters, self.speed, self._largest_force = tuple(indenters), np.zeros((len(indenters), 3)), 0.0
 
     def _advance(self, reaction: FloatArray) -> None:

@@ -65,10 +65,13 @@ class ExplicitStepper(Stepper):
     forward: bool
     control: IntArray = field(default_factory=lambda: new_control(1))
     data: PackedArguments = ()
+    constrained: KernelTuple = ()
+    bodies: int = 0
 
     def constrain(self, entries: KernelTuple, bodies: int) -> None:
         """Constrain nodes from now on."""
         self.close()
+        self.constrained, self.bodies = entries, bodies
         blocks, tables, masses, parts = self.kernel
         count = len(parts[0]) - 1
         order = np.argsort(entries[0], kind="stable")

@@ -38,6 +38,8 @@ class ContactState:
         Traction of friction on the lattice, kPa.
     multiplier : ndarray, shape (indenters, n)
         Pressure at the nodes, kPa, that the foundation between them need not carry.
+    covered : ndarray, shape (indenters, n)
+        Fraction of what lies around the nodes that the indenters covered in the last step.
     thickness : ndarray, shape (indenters, f)
         Of the foundations of the faces, in lengths of the elements behind them.
     centres : ndarray, shape (indenters, 3)
@@ -60,6 +62,7 @@ class ContactState:
     extension: FloatArray
     friction: FloatArray
     multiplier: FloatArray
+    covered: FloatArray
     thickness: FloatArray
     centres: FloatArray
     axes: FloatArray
@@ -149,6 +152,6 @@ def begin_contact(
     begun, traction = np.zeros(len(gap), dtype=bool), np.zeros((len(gap), 3))
     thickness = np.array([surface.thickness(p.geometry) for p in indenters])
     return ContactState(
-        order, first, touched.astype(np.int8), touched, none, none.copy(), traction, at_node, thickness, centres, axes,
+        order, first, touched.astype(np.int8), touched, none, none.copy(), traction, at_node, at_node.copy(), thickness, centres, axes,
         begun, np.zeros((3, lattice.n_nodes)), np.zeros(1),
     )  # fmt: skip

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.contact.contact_surfaces import face_quadrature
 from naibu.mechanics.contact.indenter_geometry import IndenterGeometry
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients, implicit_coefficients
@@ -30,6 +30,7 @@ SINGLE = 0.15  # thickness where nodes touch for themselves: they stand on nothi
 FLAT_ORDER = 2  # Gauss points per side of a face under a plane, exact for the product of two shape functions
 LEAST_ORDER, MOST_ORDER = 3, 8
 RESOLVED = 0.95  # radius of an indenter over the edge of a face from which forces are within 3 % of those of a mesh twice as fine
+SWIFT = 10.0  # ratio of the stiffness of foundations to m / h^2 of nodes from which the latter follow at once
 FINENESS = 1.2  # quadrature points along the volume of an indenter over its area; 3.6 along the radius of a sphere
 
 
@@ -112,6 +113,16 @@ class ContactSurface:
         tension, spring, _, _ = explicit_coefficients(self.parameters)
         _, _, decay, growth = implicit_coefficients(self.parameters, step)
         return np.ascontiguousarray(np.stack([tension / step + spring * growth, spring * decay, decay, growth], axis=1))
+
+    def resists_at_once(self, step: float, mass: AnyFloatArray) -> bool:
+        """Return whether foundations are so stiff beside the masses (n,), kg, that their pressure is settled in a step, s.
+
+        If so, the pressure of the nodes may follow from step to step; the ratio is that of the stiffness to ``m / h^2`` at a typical node.
+        """
+        share = (self.foundation(step)[:, 0] * self.area / self.faces.shape[1]).repeat(self.faces.shape[1])
+        stiffness = np.bincount(self.faces.ravel(), share, minlength=len(self.points))
+        nodes = np.unique(self.faces)
+        return bool(step**2 * np.median(stiffness[nodes] / mass[nodes]) >= SWIFT)
 
 
 def radius_over_face(lattice: Lattice, geometry: IndenterGeometry) -> float:

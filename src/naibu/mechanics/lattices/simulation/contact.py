@@ -16,7 +16,6 @@ from naibu.mechanics.lattices.cpu.contact_stepper import PASSES, ContactStepper,
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.cpu.scratch import Scratch
 from naibu.mechanics.lattices.cpu.session import BALANCE
-from naibu.mechanics.lattices.cpu.stepper import ImplicitStepper
 from naibu.mechanics.lattices.model.contact_state import begin_contact
 from naibu.mechanics.lattices.model.lattice import Lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_numbers
@@ -69,7 +68,7 @@ def push(
     Parameters
     ----------
     engine : LatticeEngine
-        Of the implicit method.
+        Of the method ``"implicit"``, or ``"symplectic_euler"`` in double precision.
     state : LatticeState
         Where the steps begin; one in contact goes on with its contacts.
     indenters : sequence of RigidIndenter
@@ -86,7 +85,7 @@ def push(
     Raises
     ------
     InputError
-        An explicit engine, an indenter that begins inside the object, shapes that do not fit, or NaN.
+        An engine of another method, an indenter that begins inside the object, shapes that do not fit, or NaN.
     """
     count = len(np.asarray(velocity)) if steps is None else steps
     path = checked_velocity(velocity, count, len(indenters))
@@ -161,8 +160,6 @@ def _begun(
     passes: int,
     scratch: Scratch,
 ) -> ContactStepper:
-    if engine.method != "implicit":
-        raise InputError(f"contact needs method='implicit', which is stable when nodes stop at an indenter, not {engine.method!r}")
     if passes < 1:
         raise InputError(f"passes must be at least 1, not {passes}")
     surface = engine.surface()
@@ -170,16 +167,17 @@ def _begun(
     if known.indenters != len(indenters):
         raise InputError(f"state is in contact with {known.indenters} indenters, and there are {len(indenters)}")
     base = engine.stepper(state, external_force, scratch)
-    assert isinstance(base, ImplicitStepper)
     none = ConstrainedNodes.none()
     base.constrain((none.node, none.direction, none.weight, none.body), 0)
-    return ContactStepper.of(base, indenters, known, surface, engine.divided, passes)
+    return engine.in_contact(base, indenters, known, passes)
 
 
 def _motion(
     engine: LatticeEngine, stepper: ContactStepper, reaction: FloatArray, speed: FloatArray, passes: float, unsettled: int
 ) -> ContactMotion:
-    end = replace(engine.state(stepper.base), contact=stepper.contact)
+    lattice = stepper.base if stepper.forces is None else stepper.forces.stepper
+    engine.check(lattice, len(reaction))
+    end = replace(engine.state(lattice), contact=stepper.contact)
     return ContactMotion(end, reaction, speed, passes, unsettled)
 
 

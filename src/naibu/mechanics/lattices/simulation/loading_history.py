@@ -206,7 +206,7 @@ def check_study(study: LatticeStudy) -> None:
     Raises
     ------
     InputError
-        Bodies both tied and in contact, contact by an explicit method, several driven bodies, or other bodies that move beside a driven
+        Bodies both tied and in contact, contact by ``"euler"``, several driven bodies, or other bodies that move beside a driven
         one; bodies that start inside the object, or are tied to nothing.
     """
     if study.tied:
@@ -220,8 +220,8 @@ def check_study(study: LatticeStudy) -> None:
             )
         tied_constraints(study.lattice, study.bodies)
         return
-    if study.method != "implicit":
-        raise InputError(f"contact with friction needs method 'implicit', not {study.method!r}; or tie the bodies")
+    if study.method == "euler":
+        raise InputError("contact with friction needs method 'implicit' or 'symplectic_euler', not 'euler'; or tie the bodies")
     driven = [body for body in study.bodies if body.drive is not None]
     if len(driven) > 1:
         raise InputError(f"{', '.join(b.name for b in driven)} are all driven by forces; one can be")

@@ -58,7 +58,7 @@ def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoo
         directions, and the numbers of `lattice_coarse_kernels`.
     """
     if lattice.n_elements < _FEW or lattice.node_mass.sum() > _WORTH * diagonal.sum():
-        return _nothing()
+        return no_coarse_space()
     cells = _cells(lattice)
     between = _between(lattice, cells)
     corner, weight, used = _hats(lattice.points, cells)
@@ -217,7 +217,8 @@ def _lanes(source: IntArray, target: IntArray, weight: FloatArray, shift: int, p
     return starts, WIDTH * tile + gap - apart, WIDTH * number.ravel(), table
 
 
-def _nothing() -> KernelTuple:
+def no_coarse_space() -> KernelTuple:
+    """Return the arrays of no coarse correction."""
     steps, vectors = _steps(np.zeros((0, 3)), np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64), 0, 1)
     single, whole, square = np.float32, np.zeros(0, np.int64), np.zeros((0, 8), np.int64)
     small = (np.zeros((3, 0, 3, 0)), np.zeros((2, 0), single), np.zeros((3, 0)), np.zeros((2, 0, 0), single))
