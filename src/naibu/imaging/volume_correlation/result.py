@@ -275,10 +275,12 @@ def collected(
     bending: FloatArray,
     dilatation: float,
     matched: BoolArray,
+    misfit: FloatArray,
 ) -> CorrelationResult:
     """Return the result of a fit at full resolution.
 
-    `samples` (n, 3, s) are random coefficients about c. Soft cells (m,) that are not matched are not answered.
+    `samples` (n, 3, s) are random coefficients about c. Soft cells (m,) that are not matched are not answered. `misfit` (m, 3) is that of
+    `CorrelationFit.cell_misfit` at full resolution.
 
     Notes
     -----
@@ -313,7 +315,7 @@ def collected(
         full[~valid] = np.nan
     smoothed = fit.system.solved(fit.system.bending_load(c, bending), BIAS_TOLERANCE)[0]
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
-    misplaced = _misplacement_variance(fit)
+    misplaced = _misplacement_variance(fit, misfit)
     variance = _bias_variance(fit, smoothed) + remaining + misplaced
     spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
     covariance = _per_cell(system.grid, fit, spread)
@@ -357,20 +359,26 @@ def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray
 def _bias_variance(fit: CorrelationFit, smoothed: Float32Array) -> FloatArray:
     """Return the variance (m,), mm^2 along every axis, of the bias by the bending penalty, as in the notes of `collected`.
 
-    `smoothed` (n, 3) are the coefficients of what smoothing once more takes away.
+    `smoothed` (n, 3) are the coefficients of what smoothing once more takes away. It is taken at voxels: the middle of a cell at the
+    surface may lie far outside of the object, where splines extrapolate.
     """
-    length = np.linalg.norm(fit.system.at_middles(smoothed, every=True), axis=1)
-    return BIAS**2 * _averaged(fit, length**2)
+    system = fit.system
+    cells, at = _some_voxels(fit)
+    full = np.zeros((*system.active.shape, 3), np.float32)
+    full[system.active] = smoothed
+    square = (system.grid.values(full, fit.level.index[at] * fit.level.spacing) ** 2).sum(axis=1)
+    m = len(system.cells)
+    total, count = (fit.windowed(np.bincount(cells, w, minlength=m).astype(float), SHARED) for w in (square, None))
+    return np.asarray(BIAS**2 * total / count)
 
 
-def _misplacement_variance(fit: CorrelationFit) -> FloatArray:
+def _misplacement_variance(fit: CorrelationFit, misfit: FloatArray) -> FloatArray:
     """Return the variance (m,), mm^2 along every axis, of displacements that would leave the residuals beyond `MISPLACED` in a cell.
 
     A displacement by e leaves residuals g.e in a gradient g. Cells next to such a cell share its splines, and their errors.
     """
-    m, noise = len(fit.system.cells), MISPLACED * fit.residual_sd**2
-    excess = np.bincount(fit.cell_of_voxel, fit.residual.astype(float) ** 2 - noise, minlength=m)
-    gradients = np.bincount(fit.cell_of_voxel, (fit.gradient**2).sum(axis=1), minlength=m)
+    residuals, gradients, count = misfit.T
+    excess = residuals - MISPLACED * fit.residual_sd**2 * count
     of_cell = _per_cell(fit.system.grid, fit, np.maximum(excess, 0.0) / np.maximum(gradients, 1e-30))
     return np.asarray(ndimage.maximum_filter(np.nan_to_num(of_cell), 3)[tuple(fit.system.cells[:, 2:].T)])
 
@@ -411,8 +419,10 @@ def _averaged(fit: CorrelationFit, values: FloatArray) -> FloatArray:
 
 
 def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
-    """Return cells and listed voxels, a few of them spread over every cell."""
-    of = fit.cell_of_voxel
+    """Return cells and listed voxels of the object, a few of them spread over every cell."""
+    every = fit.cell_of_voxel
+    here = np.flatnonzero(fit.within | ~np.bincount(every, fit.within, minlength=len(fit.system.cells)).astype(bool)[every])
+    of = every[here]
     count = np.bincount(of, minlength=len(fit.system.cells))
     order = np.argsort(of, kind="stable")
     first = np.cumsum(count) - count
@@ -421,7 +431,7 @@ def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
     n = np.minimum(count, VOXELS_PER_CELL)[of[order]]
     size = count[of[order]]
     chosen = (rank * n) // size != ((rank - 1) * n) // size
-    return of[order][chosen], order[chosen]
+    return of[order][chosen], here[order[chosen]]
 
 
 def _per_cell(grid: SplineGrid, fit: CorrelationFit, values: FloatArray) -> FloatArray:
