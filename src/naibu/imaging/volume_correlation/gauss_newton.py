@@ -69,8 +69,8 @@ class Iterations:
 class CorrelationFit(IntensityComparison):
     """Gauss-Newton fit of a displacement field on a spline grid to the voxels of a level.
 
-    With `noisy` the gradients are multiplied by their reliability, cell by cell. `within` (n,) tells the listed voxels of the object from those
-    of a margin about it, at which no error is stated.
+    With `noisy` the gradients are multiplied by their reliability, cell by cell. `within` (n,) tells the listed voxels of the object from
+    those of a margin about it, at which no error is stated.
     """
 
     def __init__(
