@@ -103,3 +103,17 @@ def test_memory_decides_whether_a_pair_is_measured_block_by_block() -> None:
 def test_nothing_is_resumed_where_there_is_nothing(pair: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing to resume"):
         sense_blocks(*pair, out=tmp_path, plan=PLAN, resume=True)
+
+
+def test_blocks_of_other_code_are_not_resumed(pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A version number does not change with every edit, and sums of two programs add up to nothing."""
+
+    def stopped(**_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(block_checkpoint, "kept_block", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        sense_blocks(*pair, out=tmp_path / "out", plan=PLAN)
+    monkeypatch.setattr(block_checkpoint, "_digest_of_code", lambda: "of an earlier program")
+    with pytest.raises(InputError, match="another version of naibu"):
+        sense_blocks(*pair, out=tmp_path / "out", plan=PLAN, resume=True)

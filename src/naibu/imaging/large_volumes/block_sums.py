@@ -98,8 +98,8 @@ class ComparedBlock:
         z, y, x of the cells.
     matrix, load, draws : ndarray, shape (k, 3, 1029), (k, 3) and (k, 3, s)
         Of the intensities alone: normal matrix, load, random loads.
-    agreement, content : ndarray, shape (m, 12) and (m, 8)
-        See `CorrelationFit.cell_agreement` and `content_sums`.
+    agreement, misfit, content : ndarray, shape (m, 12), (m, 3) and (m, 8)
+        See `CorrelationFit.cell_agreement`, `CorrelationFit.cell_misfit` and `content_sums`.
     products, pairs : ndarray
         Sums of products of residuals, and their numbers, by distance.
     small : BlockSums, optional
@@ -120,6 +120,7 @@ class ComparedBlock:
     load: Float32Array
     draws: Float32Array
     agreement: FloatArray
+    misfit: FloatArray
     content: FloatArray
     products: AnyFloatArray
     pairs: AnyFloatArray
@@ -158,6 +159,7 @@ def compared_block(
     fit.compare(_local_coefficients(state.coefficients, block))
     soft, seen = ~part.rigid[part.mask], int(fit.seen.sum())
     jitter = fit.observed_jitter_voxels**2 * seen if state.stage == "step" else 0.0
+    misfit = fit.cell_misfit()
     for values in (fit.products, fit.force, fit.gradient):
         values[~soft] = 0
     m = len(fit.system.cells)
@@ -172,7 +174,7 @@ def compared_block(
         seen, len(fit.value), _classes(fit), jitter, fit.robust_sums, _moments(fit), *gain,
         np.stack(fit.system.nodes, axis=1) + first[::-1], fit.system.cells[:, 2:] + first[::-1],
         fit.system.matrix if solving else fit.system.matrix[:0], load, _random_loads(fit, part.mask, state, block),
-        fit.cell_agreement(), content_sums(fit, part.depth(fit.level)) if at_end else np.zeros((m, 0)),
+        fit.cell_agreement(), misfit, content_sums(fit, part.depth(fit.level)) if at_end else np.zeros((m, 0)),
         products, pairs,
         _small_blocks(fit, part, state.tiles, state.draws, soft) if at_end and state.tiles else None,
     )  # fmt: skip

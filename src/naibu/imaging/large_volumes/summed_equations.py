@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from naibu.core.arrays import AnyFloatArray, Float32Array, FloatArray, IntArray
 from naibu.core.chunked_volume import ChunkedVolume
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.large_volumes.block_frame import BlockFrame
@@ -91,6 +92,9 @@ class SummedEquations:
         self.coarse, self.fit, self.system, self.volume = coarse, fit, fit.system, volume
         self.lattice = GainMap(fit.level, fit.settings.gain_cell_mm or float(fit.level.spacing.max()) * max(fit.level.mask.shape))
         self.frame = self._frame(factor)
+        # coarse voxels are in a given mask, too, where little of them is: no error is stated where the object hardly is
+        within = ndimage.binary_erosion(coarse.mask, border_value=1) if factor > 1 else coarse.mask
+        fit.within = within[tuple(fit.level.index.astype(int).T[::-1])]
         everywhere = self.lattice.everywhere(fit.value, fit.robust_weight)
         matrix, load = self.lattice.normal_equations(fit.value, fit.robust_weight)
         reliability = fit.reliability_of(fit.cell_agreement())
@@ -201,9 +205,14 @@ class SummedEquations:
         model = self._with_intensities(sums)
         fit.gain, fit.offset = self.lattice.values(model.gain)
         fit.residual_sd = model.residual_sd
-        found = collected(coarse.volume, fit, coarse.c, samples, coarse.bending, coarse.dilatation, content.matched)
-        small = displacement_of_blocks(self.volume.grid, BlockSums.joined(sums.small), self.frame.spacing, scale) if sums.small else None
-        return replace(found, blocks=small)
+        found = collected(coarse.volume, fit, coarse.c, samples, coarse.bending, coarse.dilatation, content.matched, sums.misfit)
+        return replace(found, blocks=self._small_blocks(sums.small, scale) if sums.small else None)
+
+    def _small_blocks(self, parts: list[BlockSums], scale: float) -> DisplacementField:
+        joined = BlockSums.joined(parts)
+        # tiles are drawn without the factor that forces lose by robustness
+        scaled = replace(joined, drawn=scale * joined.drawn)
+        return displacement_of_blocks(self.volume.grid, scaled, self.frame.spacing, scale)
 
     def _adapt(self, sums: _Sums, before: FloatArray) -> None:
         """Choose the weights of the penalties as in memory."""
@@ -310,7 +319,7 @@ class _Sums:
         self.seen, self.voxels, self.jitter, self.robust = 0, 0, 0.0, np.zeros(2)
         self.matrix, self.load = np.zeros((nodes, 3, 1029), np.float32), np.zeros((nodes, 3), np.float32)
         self.classes, self.moments = np.zeros(len(CLASSES) + 1, np.int64), np.zeros(5)
-        self.agreement, self.cells = np.zeros((cells, 12)), cells
+        self.agreement, self.misfit, self.cells = np.zeros((cells, 12)), np.zeros((cells, 3)), cells
         self.draws, self.content = np.zeros((nodes, 3, 0), np.float32), np.zeros((cells, 0))
         self.gain_matrix, self.gain_load, self.products, self.pairs = (np.zeros(()) for _ in range(4))
         self.small: list[BlockSums] = []
@@ -332,6 +341,7 @@ class _Sums:
         self.load[nodes] += block.load
         self.draws[nodes] += block.draws
         self.agreement[cells] += block.agreement
+        self.misfit[cells] += block.misfit
         self.content[cells] += block.content
         self.small += [] if block.small is None else [block.small]
 

@@ -346,7 +346,8 @@ class Correlation:
         noise = ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), lost_to_robustness(*fit.robust_sums))
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
         blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2)
-        return replace(collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content.matched), blocks=blocks)
+        weights = self.bending, self.dilatation
+        return replace(collected(self.volume, fit, self.c, samples, *weights, content.matched, fit.cell_misfit()), blocks=blocks)
 
 
 def require_overlap(seen: float) -> None:

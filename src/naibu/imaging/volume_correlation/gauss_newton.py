@@ -69,7 +69,8 @@ class Iterations:
 class CorrelationFit(IntensityComparison):
     """Gauss-Newton fit of a displacement field on a spline grid to the voxels of a level.
 
-    With `noisy` the gradients are multiplied by their reliability, cell by cell.
+    With `noisy` the gradients are multiplied by their reliability, cell by cell. `within` (n,) tells the listed voxels of the object from
+    those of a margin about it, at which no error is stated.
     """
 
     def __init__(
@@ -84,6 +85,7 @@ class CorrelationFit(IntensityComparison):
         super().__init__(level, settings)
         self.system, self.inclusions, self.noisy = system, inclusions, noisy
         self.reliability: Float32Array | None = None
+        self.within = np.ones(len(level.intensity), dtype=bool)
         self.last_step = np.zeros((system.n, 3), np.float32)
         self.still_mm = STILL * float(np.prod(level.spacing) ** (1 / 3))
 
@@ -154,6 +156,11 @@ class CorrelationFit(IntensityComparison):
         dense[at] = values
         sigma = (width,) * 3 + (0,) * (values.ndim - 1)
         return np.asarray(ndimage.gaussian_filter(dense, sigma, mode="constant")[at])
+
+    def cell_misfit(self) -> FloatArray:
+        """Return sums (m, 3) over the voxels of every cell: squared residuals, squared gradients, per mm^2, and their number."""
+        squares = self.residual.astype(float) ** 2, (self.gradient**2).sum(axis=1)
+        return np.stack([self.cell_sums(v) for v in (*squares, np.ones(len(self.residual)))], axis=1)
 
     def cell_agreement(self) -> FloatArray:
         """Return the products of gradients (m, 12) summed over the voxels of every cell."""

@@ -8,26 +8,25 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage
 
-from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, Int32Array, IntArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, Int32Array
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
+from naibu.imaging.volume_correlation.cell_errors import (
+    BIAS_TOLERANCE,
+    REMAINING,
+    bias_variance,
+    misplacement_variance,
+    per_cell,
+    sampled_covariance,
+    strain_variance,
+)
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.rigid_inclusions import InclusionMotion
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable, separable_slice
 
-VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
-SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples
-REMAINING = 5.0  # empirical: last steps that a cell which has not converged may still be away from the solution
-# empirical: standard deviation along every axis of the bias by the bending penalty, in lengths of the change that smoothing the field once
-# more makes. Errors of legs and chests exceed what the samples say by 4 to 5 such lengths in three axes, and along the change only in part
-BIAS, BIAS_TOLERANCE = 1.9, 0.03
-# empirical: mean square of the residuals of a cell, in variances of the noise, beyond which structures lie at the wrong place there. Edges
-# in legs reach 8 in one cell of a hundred; lungs that slide by 5 to 17 mm along the chest wall 8 to 100 in one cell of twenty
-MISPLACED = 8.0
 LEAST_KNOWN = 1e-4  # weight of the known cells about a voxel, from which it is interpolated among all voxels at once
 
 
@@ -275,10 +274,12 @@ def collected(
     bending: FloatArray,
     dilatation: float,
     matched: BoolArray,
+    misfit: FloatArray,
 ) -> CorrelationResult:
     """Return the result of a fit at full resolution.
 
-    `samples` (n, 3, s) are random coefficients about c. Soft cells (m,) that are not matched are not answered.
+    `samples` (n, 3, s) are random coefficients about c. Soft cells (m,) that are not matched are not answered. `misfit` (m, 3) is that of
+    `CorrelationFit.cell_misfit` at full resolution.
 
     Notes
     -----
@@ -313,121 +314,18 @@ def collected(
         full[~valid] = np.nan
     smoothed = fit.system.solved(fit.system.bending_load(c, bending), BIAS_TOLERANCE)[0]
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
-    misplaced = _misplacement_variance(fit)
-    variance = _bias_variance(fit, smoothed) + remaining + misplaced
+    misplaced = misplacement_variance(fit, misfit)
+    variance = bias_variance(fit, smoothed) + remaining + misplaced
     spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
-    covariance = _per_cell(system.grid, fit, spread)
-    strain_sd = np.sqrt(_strain_variance(fit, c, samples, smoothed) + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2)
+    covariance = per_cell(system.grid, fit, spread)
+    strain_sd = np.sqrt(strain_variance(fit, c, samples, smoothed) + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2)
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
-        _per_cell(system.grid, fit, strain_sd), _per_cell(system.grid, fit, misplaced), _per_cell(system.grid, fit, bending), dilatation,
+        per_cell(system.grid, fit, strain_sd), per_cell(system.grid, fit, misplaced), per_cell(system.grid, fit, bending), dilatation,
         fit.residual_sd, maps[0], maps[1], converged, inclusions, motions, _status(system.grid, volume, converged),
     )  # fmt: skip
-
-
-def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray:
-    """Return the mean covariance (m, 3, 3), mm^2 along the axes of the volume, of the voxels of every cell.
-
-    Parameters
-    ----------
-    fit : Correlation
-        The fit.
-    samples : ndarray, shape (n, 3, s)
-        Random coefficients about those of the fit, mm.
-    """
-    system = fit.system
-    cells, at = _some_voxels(fit)
-    full = np.zeros((*system.active.shape, *samples.shape[1:]), np.float32)
-    full[system.active] = samples
-    moves = system.grid.values(full, fit.level.index[at] * fit.level.spacing)
-    each = np.einsum("nis,njs->nij", moves, moves) / samples.shape[2]
-    total, count = np.zeros((len(system.cells), 3, 3)), np.bincount(cells, minlength=len(system.cells))
-    np.add.at(total, cells, each)
-    dense = np.zeros((*(int(n) for n in system.grid.cells[::-1]), 10))
-    z, y, x = system.cells[:, 2:].T
-    # a cell counts as much as it holds of the object: what little a rim cell holds is near its neighbours
-    dense[z, y, x, 0] = np.maximum(count, 1e-6)
-    dense[z, y, x, 1:] = total.reshape(-1, 9)
-    wide = ndimage.gaussian_filter(dense, (SHARED, SHARED, SHARED, 0), mode="constant", truncate=3.0)[z, y, x]
-    return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
-
-
-def _bias_variance(fit: CorrelationFit, smoothed: Float32Array) -> FloatArray:
-    """Return the variance (m,), mm^2 along every axis, of the bias by the bending penalty, as in the notes of `collected`.
-
-    `smoothed` (n, 3) are the coefficients of what smoothing once more takes away.
-    """
-    length = np.linalg.norm(fit.system.at_middles(smoothed, every=True), axis=1)
-    return BIAS**2 * _averaged(fit, length**2)
-
-
-def _misplacement_variance(fit: CorrelationFit) -> FloatArray:
-    """Return the variance (m,), mm^2 along every axis, of displacements that would leave the residuals beyond `MISPLACED` in a cell.
-
-    A displacement by e leaves residuals g.e in a gradient g. Cells next to such a cell share its splines, and their errors.
-    """
-    m, noise = len(fit.system.cells), MISPLACED * fit.residual_sd**2
-    excess = np.bincount(fit.cell_of_voxel, fit.residual.astype(float) ** 2 - noise, minlength=m)
-    gradients = np.bincount(fit.cell_of_voxel, (fit.gradient**2).sum(axis=1), minlength=m)
-    of_cell = _per_cell(fit.system.grid, fit, np.maximum(excess, 0.0) / np.maximum(gradients, 1e-30))
-    return np.asarray(ndimage.maximum_filter(np.nan_to_num(of_cell), 3)[tuple(fit.system.cells[:, 2:].T)])
-
-
-def _strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, smoothed: Float32Array) -> FloatArray:
-    """Return the mean square error (m,) of a component of the Green-Lagrange strain in the middles of the cells.
-
-    Both parts are as those of the displacement: the samples, and the bias, whose direction is unknown, three times.
-    """
-    system = fit.system
-    deformation = np.eye(3) + _gradients_at_middles(fit, c)
-    full = np.zeros((*system.active.shape, 3))
-
-    def mean_square(coefficients: Float32Array) -> FloatArray:
-        full[system.active] = coefficients
-        change = np.swapaxes(deformation, -1, -2) @ _gradients_at_middles(fit, full)
-        return np.asarray(((0.5 * (change + np.swapaxes(change, -1, -2))) ** 2).mean(axis=(-2, -1)))
-
-    drawn = sum((mean_square(samples[..., s]) for s in range(samples.shape[2])), start=np.zeros(len(system.cells)))
-    return _averaged(fit, drawn / samples.shape[2] + 3.0 * BIAS**2 * mean_square(smoothed))
-
-
-def _gradients_at_middles(fit: CorrelationFit, c: FloatArray) -> FloatArray:
-    """Return du_i/dx_j (m, 3, 3) of splines c (NZ, NY, NX, 3) in the middles of the cells, along the axes of the volume."""
-    grid = fit.system.grid
-    middles = [grid.origin_mm[a] + (np.arange(grid.cells[a]) + 0.5) * grid.step_mm[a] for a in range(3)]
-    plain = [grid.matrix(a, middles[a]) for a in range(3)]
-    at = tuple(fit.system.cells[:, 2:].T)
-    out = np.empty((len(fit.system.cells), 3, 3))
-    for j in range(3):
-        out[..., j] = separable([grid.matrix(a, middles[a], 1) if a == j else plain[a] for a in range(3)], c)[at]
-    return out
-
-
-def _averaged(fit: CorrelationFit, values: FloatArray) -> FloatArray:
-    """Return values (m,) of the cells averaged with those of their neighbours."""
-    return np.asarray(fit.windowed(values, SHARED) / fit.windowed(np.ones_like(values), SHARED))
-
-
-def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
-    """Return cells and listed voxels, a few of them spread over every cell."""
-    of = fit.cell_of_voxel
-    count = np.bincount(of, minlength=len(fit.system.cells))
-    order = np.argsort(of, kind="stable")
-    first = np.cumsum(count) - count
-    rank = np.arange(len(of)) - first[of[order]]
-    # voxels in the middles of so many equal stretches of the cell's list
-    n = np.minimum(count, VOXELS_PER_CELL)[of[order]]
-    size = count[of[order]]
-    chosen = (rank * n) // size != ((rank - 1) * n) // size
-    return of[order][chosen], order[chosen]
-
-
-def _per_cell(grid: SplineGrid, fit: CorrelationFit, values: FloatArray) -> FloatArray:
-    out = np.full((*(int(n) for n in grid.cells[::-1]), *values.shape[1:]), np.nan)
-    out[tuple(fit.system.cells[:, 2:].T)] = values
-    return out
 
 
 def _middles_mm(grid: SplineGrid, volume: Volume, which: BoolArray) -> FloatArray:

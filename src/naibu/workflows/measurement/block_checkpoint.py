@@ -5,6 +5,7 @@ Nothing that is read from it is executed (see `naibu.io.files.object_archive`).
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -18,6 +19,7 @@ from naibu._version import __version__
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
+from naibu.imaging import large_volumes
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.object_archive import packed, unpacked
 from naibu.io.images import can_be_opened, open_volume, read_volume
@@ -95,7 +97,7 @@ class BlockCheckpoint:
             Nothing to resume, something that could be, or another measurement.
         """
         head = self.folder / _HEAD
-        told = {"naibu": __version__} | of
+        told = {"naibu": __version__, "code": _digest_of_code()} | of
         whole = json.dumps({"of": told, "plan": plan}, indent=1) + "\n"
         if resume:
             if not head.is_file():
@@ -173,6 +175,14 @@ def kept_block(
 def _raise_what_failed(_: int, outcome: Outcome) -> None:
     """Stop at the first block that cannot be computed."""
     outcome.value()
+
+
+@lru_cache(maxsize=1)
+def _digest_of_code() -> str:
+    """Return a digest of the modules that compute blocks: sums of another code must not be added to those of this one."""
+    imaging = Path(large_volumes.__file__).parent.parent
+    files = sorted(file for room in ("large_volumes", "volume_correlation", "preprocessing") for file in (imaging / room).glob("*.py"))
+    return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 
 @lru_cache(maxsize=1)

@@ -1,0 +1,132 @@
+"""Variances of the errors of volume correlation by cells of its grid: noise, bias of the penalty, structures at the wrong place, strain."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from naibu.core.arrays import Float32Array, FloatArray, IntArray
+from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
+from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+
+VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
+SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples
+REMAINING = 5.0  # empirical: last steps that a cell which has not converged may still be away from the solution
+# empirical: standard deviation along every axis of the bias by the bending penalty, in lengths of the change that smoothing the field once
+# more makes. Errors of legs and chests exceed what the samples say by 4 to 5 such lengths in three axes, and along the change only in part
+BIAS, BIAS_TOLERANCE = 1.9, 0.03
+# empirical: mean square of the residuals of a cell, in variances of the noise, beyond which structures lie at the wrong place there. Edges
+# in legs reach 8 in one cell of a hundred; lungs that slide by 5 to 17 mm along the chest wall 8 to 100 in one cell of twenty
+MISPLACED = 8.0
+
+
+def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray:
+    """Return the mean covariance (m, 3, 3), mm^2 along the axes of the volume, of the voxels of every cell.
+
+    Parameters
+    ----------
+    fit : Correlation
+        The fit.
+    samples : ndarray, shape (n, 3, s)
+        Random coefficients about those of the fit, mm.
+    """
+    system = fit.system
+    cells, at = _some_voxels(fit)
+    full = np.zeros((*system.active.shape, *samples.shape[1:]), np.float32)
+    full[system.active] = samples
+    moves = system.grid.values(full, fit.level.index[at] * fit.level.spacing)
+    each = np.einsum("nis,njs->nij", moves, moves) / samples.shape[2]
+    total, count = np.zeros((len(system.cells), 3, 3)), np.bincount(cells, minlength=len(system.cells))
+    np.add.at(total, cells, each)
+    dense = np.zeros((*(int(n) for n in system.grid.cells[::-1]), 10))
+    z, y, x = system.cells[:, 2:].T
+    # a cell counts as much as it holds of the object: what little a rim cell holds is near its neighbours
+    dense[z, y, x, 0] = np.maximum(count, 1e-6)
+    dense[z, y, x, 1:] = total.reshape(-1, 9)
+    wide = ndimage.gaussian_filter(dense, (SHARED, SHARED, SHARED, 0), mode="constant", truncate=3.0)[z, y, x]
+    return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
+
+
+def bias_variance(fit: CorrelationFit, smoothed: Float32Array) -> FloatArray:
+    """Return the variance (m,), mm^2 along every axis, of the bias by the bending penalty, as in the notes of `collected`.
+
+    `smoothed` (n, 3) are the coefficients of what smoothing once more takes away. It is taken at voxels: the middle of a cell at the
+    surface may lie far outside of the object, where splines extrapolate.
+    """
+    system = fit.system
+    cells, at = _some_voxels(fit)
+    full = np.zeros((*system.active.shape, 3))
+    full[system.active] = smoothed
+    square = (system.grid.values(full, fit.level.index[at] * fit.level.spacing) ** 2).sum(axis=1)
+    m = len(system.cells)
+    total, count = (fit.windowed(np.bincount(cells, w, minlength=m).astype(float), SHARED) for w in (square, None))
+    return np.asarray(BIAS**2 * total / count)
+
+
+def misplacement_variance(fit: CorrelationFit, misfit: FloatArray) -> FloatArray:
+    """Return the variance (m,), mm^2 along every axis, of displacements that would leave the residuals beyond `MISPLACED` in a cell.
+
+    A displacement by e leaves residuals g.e in a gradient g. Cells next to such a cell share its splines, and their errors.
+    """
+    residuals, gradients, count = misfit.T
+    excess = residuals - MISPLACED * fit.residual_sd**2 * count
+    of_cell = per_cell(fit.system.grid, fit, np.maximum(excess, 0.0) / np.maximum(gradients, 1e-30))
+    return np.asarray(ndimage.maximum_filter(np.nan_to_num(of_cell), 3)[tuple(fit.system.cells[:, 2:].T)])
+
+
+def strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, smoothed: Float32Array) -> FloatArray:
+    """Return the mean square error (m,) of a component of the Green-Lagrange strain in the middles of the cells.
+
+    Both parts are as those of the displacement: the samples, and the bias, whose direction is unknown, three times.
+    """
+    system = fit.system
+    deformation = np.eye(3) + _gradients_at_middles(fit, c)
+    full = np.zeros((*system.active.shape, 3))
+
+    def mean_square(coefficients: Float32Array) -> FloatArray:
+        full[system.active] = coefficients
+        change = np.swapaxes(deformation, -1, -2) @ _gradients_at_middles(fit, full)
+        return np.asarray(((0.5 * (change + np.swapaxes(change, -1, -2))) ** 2).mean(axis=(-2, -1)))
+
+    drawn = sum((mean_square(samples[..., s]) for s in range(samples.shape[2])), start=np.zeros(len(system.cells)))
+    return _averaged(fit, drawn / samples.shape[2] + 3.0 * BIAS**2 * mean_square(smoothed))
+
+
+def _gradients_at_middles(fit: CorrelationFit, c: FloatArray) -> FloatArray:
+    """Return du_i/dx_j (m, 3, 3) of splines c (NZ, NY, NX, 3) in the middles of the cells, along the axes of the volume."""
+    grid = fit.system.grid
+    middles = [grid.origin_mm[a] + (np.arange(grid.cells[a]) + 0.5) * grid.step_mm[a] for a in range(3)]
+    plain = [grid.matrix(a, middles[a]) for a in range(3)]
+    at = tuple(fit.system.cells[:, 2:].T)
+    out = np.empty((len(fit.system.cells), 3, 3))
+    for j in range(3):
+        out[..., j] = separable([grid.matrix(a, middles[a], 1) if a == j else plain[a] for a in range(3)], c)[at]
+    return out
+
+
+def _averaged(fit: CorrelationFit, values: FloatArray) -> FloatArray:
+    """Return values (m,) of the cells averaged with those of their neighbours."""
+    return np.asarray(fit.windowed(values, SHARED) / fit.windowed(np.ones_like(values), SHARED))
+
+
+def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
+    """Return cells and listed voxels of the object, a few of them spread over every cell."""
+    every = fit.cell_of_voxel
+    here = np.flatnonzero(fit.within | ~np.bincount(every, fit.within, minlength=len(fit.system.cells)).astype(bool)[every])
+    of = every[here]
+    count = np.bincount(of, minlength=len(fit.system.cells))
+    order = np.argsort(of, kind="stable")
+    first = np.cumsum(count) - count
+    rank = np.arange(len(of)) - first[of[order]]
+    # voxels in the middles of so many equal stretches of the cell's list
+    n = np.minimum(count, VOXELS_PER_CELL)[of[order]]
+    size = count[of[order]]
+    chosen = (rank * n) // size != ((rank - 1) * n) // size
+    return of[order][chosen], here[order[chosen]]
+
+
+def per_cell(grid: SplineGrid, fit: CorrelationFit, values: FloatArray) -> FloatArray:
+    """Return values (m, ...) of the cells on their grid (CZ, CY, CX, ...); NaN where there is no object."""
+    out = np.full((*(int(n) for n in grid.cells[::-1]), *values.shape[1:]), np.nan)
+    out[tuple(fit.system.cells[:, 2:].T)] = values
+    return out
