@@ -106,7 +106,7 @@ def test_a_virtual_specimen_is_recovered_within_its_intervals() -> None:
         [data.experiment],
         known_materials=KnownMaterials({"stiff": 222.0}),
         noise=NoiseModel(0.15),
-        settings=ModelSettings(element_size_mm=10.0),
+        settings=ModelSettings(element_size_mm=6.0),
     )
     model = CalibratedModel.of(found)
     assert found.match.status.ok
@@ -115,8 +115,8 @@ def test_a_virtual_specimen_is_recovered_within_its_intervals() -> None:
     assert abs(model.parameters.values()[poisson_ratio("soft")] - 0.48) < 0.01
     values = model.parameters.values()
     for name in (p.name for p in model.parameters.free if p.name in truth):
-        if name.endswith("friction"):  # cells of 10 mm blur the edge of the contact, where slip begins
-            assert values[name] == pytest.approx(truth[name], rel=0.4), name
+        if name.endswith("friction"):  # cells blur the edge of the contact, where slip begins: those of 10 mm bias it by 40 %
+            assert values[name] == pytest.approx(truth[name], rel=0.25), name
         else:
             low, high = model.interval(name, width=3.3)
             assert low <= truth[name] <= high, name
