@@ -16,7 +16,7 @@ from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel, SamePath, SolvedLoadCase
 from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
-from naibu.identification.prediction import prediction, solved_state
+from naibu.identification.prediction import prediction
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.platen_position import Gauge, outermost_markers
 from naibu.identification.prediction.prediction import predict_state
@@ -79,23 +79,6 @@ def test_the_path_tells_how_the_distance_changes_and_a_solution_nearby_where_the
     assert len(differentiated) - alone == alone == 1  # for the uncertainty alone
     assert again.platen_position_mm == pytest.approx(found.platen_position_mm, abs=0.01)
     np.testing.assert_allclose(again.points, found.points, atol=0.01)
-
-
-@pytest.mark.parametrize("by_markers", [True, False])
-def test_a_solution_by_way_of_larger_elements_is_that_from_rest(
-    squeezed: Experiment, monkeypatch: pytest.MonkeyPatch, by_markers: bool
-) -> None:
-    model, solved = model_of(squeezed), []
-    solve = gauss_newton.solve
-    monkeypatch.setattr(gauss_newton, "solve", lambda problem, **k: solved.append(len(problem.points)) or solve(problem, **k))
-    direct = predict_state(model, squeezed, "pressed", heights_from_markers=by_markers)
-    assert len(set(solved)) == 1
-    monkeypatch.setattr(solved_state, "WORTHWHILE", 0)
-    by_way = predict_state(model, squeezed, "pressed", heights_from_markers=by_markers)
-    assert len(set(solved)) == 2 and solved[-1] == max(solved)
-    assert by_way.platen_position_mm == pytest.approx(direct.platen_position_mm, abs=0.01)
-    np.testing.assert_allclose(by_way.points, direct.points, atol=0.01)
-    np.testing.assert_allclose(by_way.sd_model_mm, direct.sd_model_mm, rtol=0.05)
 
 
 def test_states_of_a_path_are_met_where_the_body_was_in_them() -> None:

@@ -98,16 +98,11 @@ def mesh_error(
     return MeshError(max(sizes), abs(factor) * float(np.sqrt(squares.mean())), factor * step)
 
 
-def marker_error(
-    load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float], known: Sequence[WarmStart] | None = None
-) -> FloatArray:
-    """Return how far vanishing elements would move the markers (k, 3) of a solved load case, mm, by a coarser mesh; 0 where it has none.
-
-    The states on the coarser mesh start from those `known`, or else from those of the fit.
-    """
+def marker_error(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float]) -> FloatArray:
+    """Return how far vanishing elements would move the markers (k, 3) of a solved load case, mm, by a coarser mesh; 0 where it has none."""
     size = element_size(load_case.specimen.experiment, load_case.specimen.settings.element_size_mm)
     try:
-        return np.asarray(-change_on_mesh(load_case, fit, values, size * RATIO, known) / (RATIO**ORDER - 1.0))
+        return np.asarray(-change_on_mesh(load_case, fit, values, size * RATIO) / (RATIO**ORDER - 1.0))
     except (ConvergenceError, InputError):
         return np.zeros_like(fit.predicted)
 

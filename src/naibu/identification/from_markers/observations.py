@@ -204,10 +204,6 @@ class SamePath(SolvedLoadCase):
 
     def warm_start(self, values: Mapping[str, float]) -> list[WarmStart]:
         """Return its states at the loads at which the body is where it was in them, and what they tell of the other end."""
-        estimates = self._on_own_mesh()
-        return estimates if self.between is None else [(load, np.asarray(self.between @ u)) for load, u in estimates]
-
-    def _on_own_mesh(self) -> list[WarmStart]:
         states, loads = self.fit.solution.states, self._loads
         known = [(x, s.displacement) for x, s in zip(loads[1:], states[1:], strict=True) if x < 1.0 - NEAR_THE_END]
         if loads[-1] < 1.0 - NEAR_THE_END:  # the rest of the way is a step of its own
@@ -219,9 +215,7 @@ class SamePath(SolvedLoadCase):
 
     @property
     def stiffness(self) -> dict[float, tuple[FloatArray, ...]]:
-        """Penalties of contact of the states by their loads, those of the last at the other end; none for another mesh."""
-        if self.between is not None:
-            return {}
+        """Penalties of contact of the states by their loads; those of the last at the other end."""
         states = self.fit.solution.states
         by_load = {x: s.normal_stiffness for x, s in zip(self._loads[1:], states[1:], strict=True)}
         return by_load | {1.0: states[-1].normal_stiffness}

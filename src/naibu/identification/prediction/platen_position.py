@@ -189,6 +189,7 @@ def fitted_platen_position(matcher: Matcher, fit: LoadCaseFit, name: str, gauge:
         The state cannot be solved.
     """
     parameters, body = matcher.parameters, matcher.load_cases[0].specimen
+    start = body.experiment.full_platen_position_mm
     rate = _rate_along_path(body, fit, parameters.values(), name, gauge)
     for _ in range(8):
         if rate < LEAST_RATE:
@@ -198,33 +199,13 @@ def fitted_platen_position(matcher: Matcher, fit: LoadCaseFit, name: str, gauge:
         change = float(np.clip((gauge.measured_mm - distance) / rate, -5.0, 5.0))
         if abs(change) < accuracy:
             break
-        near = same_path(fit, parameters, body.experiment, name, position + change)
+        reached = (position - start) / (position + change - start) if position + change < start else 0.0
+        near = SamePath(fit, parameters, reached=reached) if reached > 0.0 else None
         parameters = parameters.with_values({name: position + change})
         fit = matcher.evaluate(parameters.values(), [near], [fit.pose], derivatives=False)[0]
         if abs(change) > accuracy:
             rate = (gauge.distance(fit.predicted) - distance) / change
     return parameters, fit
-
-
-def same_path(fit: LoadCaseFit, parameters: ParameterSet, experiment: Experiment, name: str, position_mm: float) -> SamePath | None:
-    """Return a solution as one to start from to another platen position, mm; None where that leaves the object unloaded.
-
-    Parameters
-    ----------
-    fit : LoadCaseFit
-        The solution.
-    parameters : ParameterSet
-        The parameters that gave it.
-    experiment : Experiment
-        What was measured.
-    name : str
-        Of the platen position.
-    position_mm : float
-        The other platen position.
-    """
-    start = experiment.full_platen_position_mm
-    reached = (parameters.values()[name] - start) / (position_mm - start) if position_mm < start else 0.0
-    return SamePath(fit, parameters, reached=reached) if reached > 0.0 else None
 
 
 def _rate_along_path(body: Specimen, fit: LoadCaseFit, values: Mapping[str, float], name: str, gauge: Gauge) -> float:

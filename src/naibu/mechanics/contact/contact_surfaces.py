@@ -45,7 +45,6 @@ class Friction:
 def rigid_contact(
     name: str, points: FloatArray, faces: IntArray, surface: IndenterGeometry, *, start: ArrayLike, stop: ArrayLike,
     friction: Friction | list[Friction], normal_stiffness: float, tied: bool = False, rotation: FloatArray | None = None,
-    hardening_depth: float = np.inf,
 ) -> Contact:  # fmt: skip
     """Return the contact of boundary faces with a rigid body.
 
@@ -69,19 +68,15 @@ def rigid_contact(
         Whether the body is tied to the faces: neither separation nor slip.
     rotation : ndarray, shape (3, 3), optional
         Constant orientation of the body.
-    hardening_depth : float
-        Penetration, as a fraction of the edge of a face, at which the pressure is twice that of the penalty alone; see `Contact`.
 
     Raises
     ------
     InputError
-        No faces, or a penalty or a depth that is not positive.
+        No faces, or a penalty that is not positive.
     """
     if len(faces) == 0:
         raise InputError(f"{name}: faces is empty; check the selection of the surface")
     require_positive(f"{name}: normal_stiffness", normal_stiffness, "kPa/mm")
-    if not hardening_depth > 0.0:
-        raise InputError(f"{name}: hardening_depth is {hardening_depth:g}; it must be a positive fraction of the edge of a face")
     shape, area = face_quadrature(points, faces)
     n_q = shape.shape[0]
     nodes = np.repeat(faces, n_q, axis=0)
@@ -91,7 +86,7 @@ def rigid_contact(
         name, nodes, coefficients, np.einsum("pk,pki->pi", coefficients, points[nodes]), area.ravel(), surface,
         np.asarray(start, dtype=float), np.asarray(stop, dtype=float), np.eye(3) if rotation is None else rotation,
         np.full(len(nodes), normal_stiffness), np.repeat([f.stiffness for f in pairs], n_q),
-        np.repeat([f.coefficient for f in pairs], n_q), np.repeat(np.sqrt(area.sum(axis=1)), n_q), tied, hardening_depth=hardening_depth,
+        np.repeat([f.coefficient for f in pairs], n_q), np.repeat(np.sqrt(area.sum(axis=1)), n_q), tied,
     )  # fmt: skip
 
 

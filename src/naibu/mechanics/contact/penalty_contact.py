@@ -2,9 +2,8 @@
 
 Contact is evaluated at points, each a fixed combination of nodes: quadrature points of boundary faces against a rigid body, or pairs
 of nodes on an interface between blocks. Per unit of reference area the pressure is ``p = k_n <-g>`` (a C1 ramp; or ``-k_n g`` where tied),
-times ``1 + (g/h)^2`` up to a few h where contact hardens, and the tangential traction t follows by a return mapping of the elastic
-predictor ``t = k_t P (y - a)`` to ``|t| <= mu p``; `a` is the anchor of the point, a history variable. Large k_t and mu stick; finite k_t
-with mu = inf are tangential springs; mu = 0 is frictionless.
+and the tangential traction t follows by a return mapping of the elastic predictor ``t = k_t P (y - a)`` to ``|t| <= mu p``; `a` is the
+anchor of the point, a history variable. Large k_t and mu stick; finite k_t with mu = inf are tangential springs; mu = 0 is frictionless.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ from naibu.mechanics.contact.indenter_geometry import IndenterGeometry, packed_g
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
 RAMP_MM = 0.01  # penetration over which the contact pressure rises smoothly
-HARDENS_TO = 2.5  # times the penetration that doubles the pressure; beyond, contact that hardens is linear, as Newton's method likes it
 STICK = 1e3  # a friction coefficient that never slips in practice
 
 
@@ -58,9 +56,6 @@ class Contact:
     tilt : ndarray, shape (3,), optional
         Rotation vector, rad, of the body about its reference point at full load; it grows in proportion to the load. A plate that tilts
         during loading touches flat at first; one that is tilted from the beginning would touch at an edge.
-    hardening_depth : float
-        Penetration, as a fraction of `element_size`, at which the pressure is twice that of the penalty alone; infinite for a linear law.
-        A law that hardens bounds penetration without a change of the penalties, which would depend on the load steps.
     """
 
     name: str
@@ -78,7 +73,6 @@ class Contact:
     element_size: FloatArray
     tied: bool = False
     tilt: FloatArray | None = None
-    hardening_depth: float = np.inf
 
     def orientation(self, load: float) -> FloatArray:
         """Return the body's orientation (3, 3) at the fraction `load` of the path."""
@@ -129,8 +123,8 @@ class Contact:
         response = ContactResponse(self.orientation(load), y, np.empty(n), *vectors, *matrices)
         _tractions(
             packed_geometry(self.surface), self.surface.axes, y, anchors, self.area, self.normal_stiffness, self.tangential_stiffness,
-            self.friction_coefficient, self.hardening_depth * self.element_size, self.tied, float(curvature), response.gap, response.force,
-            response.tangential, response.slip_direction, response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
+            self.friction_coefficient, self.tied, float(curvature), response.gap, response.force, response.tangential,
+            response.slip_direction, response.stiffness, response.tangential_stiffness, response.anchor_stiffness,
         )  # fmt: skip
         return response
 
@@ -189,30 +183,20 @@ class ContactResponse:
 
 
 @njit(cache=True, inline="always")
-def normal_pressure(g, k_n, doubled, tied):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the pressure of a point with the gap g and its derivative by the gap, both zero where the point does not touch.
-
-    At the gap ``-doubled`` the pressure is twice that of the penalty k_n alone; its slope grows up to `HARDENS_TO` times that gap.
-    """
+def normal_pressure(g, k_n, tied):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the pressure of a point with the gap g and its derivative by the gap, both zero where the point does not touch."""
     if tied:
         return -k_n * g, -k_n
     if g >= 0.0:
         return 0.0, 0.0
-    end = -HARDENS_TO * doubled
-    x = max(g, end)
-    depth = x / doubled
-    factor = 1.0 + depth * depth
-    if x > -RAMP_MM:
-        p, slope = 0.5 * k_n * x * x / RAMP_MM, k_n * x / RAMP_MM
-    else:
-        p, slope = -k_n * (x + 0.5 * RAMP_MM), -k_n
-    slope = slope * factor + p * 2.0 * depth / doubled
-    return p * factor + slope * (g - x), slope
+    if g > -RAMP_MM:
+        return 0.5 * k_n * g * g / RAMP_MM, k_n * g / RAMP_MM
+    return -k_n * (g + 0.5 * RAMP_MM), -k_n
 
 
 @njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
-    geometry, axes, y, anchors, area, k_n, k_t, mu, doubled, tied, curvature,
+    geometry, axes, y, anchors, area, k_n, k_t, mu, tied, curvature,
     gap, force, friction, slip, stiffness, friction_stiffness, anchor_stiffness,
 ):  # fmt: skip
     """Forces and tractions of all points and their derivatives; see the module's text for the law."""
@@ -223,7 +207,7 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
         for i in range(3):
             turned[i] = y[q, 0] * axes[i, 0] + y[q, 1] * axes[i, 1] + y[q, 2] * axes[i, 2]
         gap[q] = signed_distance(geometry[0][0], geometry[1][0], mesh, turned, n, none)
-        p, dp = normal_pressure(gap[q], k_n[q], doubled[q], tied)
+        p, dp = normal_pressure(gap[q], k_n[q], tied)
         if dp == 0.0:
             continue
         distance_with_derivatives(geometry, axes, y[q], n, h)

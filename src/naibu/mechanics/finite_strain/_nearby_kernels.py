@@ -19,7 +19,7 @@ from naibu.mechanics.contact.penalty_contact import normal_pressure
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
-    geometry, axes, nodes, shape, rest, area, k_n, k_t, mu, doubled, tied, u, centre, orientation, anchors, gap, force
+    geometry, axes, nodes, shape, rest, area, k_n, k_t, mu, tied, u, centre, orientation, anchors, gap, force
 ):
     """Put the gaps of all points in place, and add the forces of those that touch to `force` (n, 3)."""
     kinds, sizes, _ = geometry
@@ -33,7 +33,7 @@ def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
             gap[p], m[0], m[1], m[2] = distance_and_normal_of_box(q[0], q[1], q[2], size[0], size[1], size[2])
         else:
             gap[p] = distance_from_primitive(kind, size, q, m, none) if kind != MESH else signed_distance(kind, size, mesh, q, m, none)
-        pressure, slope = normal_pressure(gap[p], k_n[p], doubled[p], tied)
+        pressure, slope = normal_pressure(gap[p], k_n[p], tied)
         if slope == 0.0:
             continue
         along = 0.0

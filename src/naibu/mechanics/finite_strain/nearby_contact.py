@@ -158,8 +158,7 @@ def add_contact_forces(contact: Contact, anchors: FloatArray, displacement: Floa
     c, gap = contact, np.empty(len(contact.nodes))
     add_forces(
         packed_geometry(c.surface), c.surface.axes, c.nodes, c.shape, c.rest, c.area, c.normal_stiffness, c.tangential_stiffness,
-        c.friction_coefficient, c.hardening_depth * c.element_size, c.tied, displacement, c.start + load * (c.stop - c.start),
-        c.orientation(load), anchors, gap, force,
+        c.friction_coefficient, c.tied, displacement, c.start + load * (c.stop - c.start), c.orientation(load), anchors, gap, force,
     )  # fmt: skip
     return gap
 

@@ -14,8 +14,6 @@ from naibu.mechanics.contact.penalty_contact import STICK, Contact
 from naibu.meshing.interfaces import split_at_plane
 from naibu.meshing.surface import faces_among, node_areas
 
-HARDENING_DEPTH = 0.004  # of the edge of a face: at the allowed penetration of 0.01 the pressure is 7 times that of the penalty alone
-
 
 def sliding_joints(experiment: Experiment, mesh: Mesh, normal_stiffness: float) -> tuple[Mesh, list[Contact]]:
     """Split a mesh where separately cast blocks meet, and return it with the contacts between them."""
@@ -43,10 +41,7 @@ def rigid_bodies(
     loading, size = experiment.loading, experiment.shape.size_mm
 
     def body(name: str, surface: IndenterGeometry, start: ArrayLike) -> Contact:
-        return rigid_contact(
-            name, mesh.points, faces, surface, start=start, stop=start, friction=stick, normal_stiffness=normal_stiffness,
-            hardening_depth=HARDENING_DEPTH,
-        )  # fmt: skip
+        return rigid_contact(name, mesh.points, faces, surface, start=start, stop=start, friction=stick, normal_stiffness=normal_stiffness)
 
     # where only its weight holds the object down, it starts pressed into the table by a hair, for the contact to have a stiffness
     ground = 1e-4 if loading.kind == "side_plates" else 0.0
