@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.volume_correlation._warp_kernels import add_to_cells, shrink_gradients
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
@@ -111,6 +111,10 @@ class CorrelationFit(IntensityComparison):
     def moving_fraction(self) -> float:
         """Fraction of the cells in the object that have not converged."""
         return float(self.moving[self.system.inner].mean())
+
+    def cell_sums(self, values: AnyFloatArray) -> FloatArray:
+        """Return the sums (m,) over the listed voxels (n,) of every cell."""
+        return np.bincount(self.cell_of_voxel, np.asarray(values, dtype=float), minlength=len(self.system.cells)).astype(float)
 
     def iterate(self, c: FloatArray, bending: FloatArray, dilatation: FloatArray, times: Iterations) -> FloatArray:
         """Return the coefficients after Gauss-Newton steps from c; bending (m, 3) and dilatation (m,) are weights of the cells."""
