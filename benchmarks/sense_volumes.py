@@ -27,7 +27,7 @@ from scipy import ndimage
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
-from naibu.imaging.volume_correlation.result import CorrelationResult
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 from naibu.imaging.volume_correlation.settings import CorrelationSettings
 
 Array = NDArray[Any]

@@ -7,7 +7,7 @@ import time
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
 
@@ -126,17 +126,17 @@ def identify(
     """
     of_fields = [name for name in experiments if Path(name).suffix.lower() in FIELD_FILES]
     others = [name for name in experiments if name not in of_fields]
+    of_scan: dict[str, Any] = {
+        "mask": mask, "zones": zones, "zone_name": zone_name or [], "known": known or (), "loaded": loaded or (), "unit": unit,
+        "spacing_mm": spacing_mm, "node_spacing": node_spacing, "out": out, "overwrite": overwrite,
+    }  # fmt: skip
     if not (of_fields and others) and (mask is not None or zones is not None or not others):
         require_left_out(
             "goes with markers, and these are displacement fields", states=bool(state), contact=contact != "coulomb",
             joined=joined != "tied", pixel_scale=pixel_scale != "given", cross_validate=cross_validate, resume=not resume,
             workers=where is not None,
         )  # fmt: skip
-        identify_from_fields(
-            experiments, mask=mask, zones=zones, zone_name=zone_name or [], known=known or (), law=law, each_cell=cell_map,
-            unit=unit, loaded=loaded or (), element_size_mm=element_size_mm, spacing_mm=spacing_mm, node_spacing=node_spacing, out=out,
-            overwrite=overwrite,
-        )  # fmt: skip
+        identify_from_fields(experiments, law=law, each_cell=cell_map, element_size_mm=element_size_mm, **of_scan)
         return
     from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 
@@ -146,11 +146,7 @@ def identify(
             "goes with markers or fields, not with both", each_cell=cell_map, cross_validate=cross_validate, resume=not resume,
             workers=where is not None, law=law != "neo_hookean",
         )  # fmt: skip
-        identify_from_both(
-            others, of_fields, known=known or (), states=_states(others, state or []), settings=settings, mask=mask, zones=zones,
-            zone_name=zone_name or [], loaded=loaded or (), unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing, out=out,
-            overwrite=overwrite,
-        )  # fmt: skip
+        identify_from_both(others, of_fields, states=_states(others, state or []), settings=settings, **of_scan)
         return
     require_left_out(
         "goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map, unit=unit is not None,

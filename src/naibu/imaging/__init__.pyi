@@ -29,7 +29,7 @@ from .preprocessing.object_mask import object_mask
 from .preprocessing.resampling import cropped_to_mask, masked, resampled_to_grid, resampled_to_spacing, warped, with_slices_between
 from .preprocessing.rigid_registration import RigidRegistration, register_rigid, rigid_from_points
 from .volume_correlation.correlate import correlate_volumes
-from .volume_correlation.result import CorrelationResult
+from .volume_correlation.results.correlation_result import CorrelationResult
 from .volume_correlation.settings import CorrelationSettings
 
 __all__ = [

@@ -34,7 +34,7 @@ from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_gr
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts
-from naibu.imaging.volume_correlation.result import CorrelationResult
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
 METHODS: tuple[Method, ...] = get_args(Method)

@@ -21,8 +21,8 @@ from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation import correlate, gauss_newton
 from naibu.imaging.volume_correlation.common_content import CommonContent
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
-from naibu.imaging.volume_correlation.result import CorrelationResult
-from naibu.imaging.volume_correlation.rigid_initialization import RigidInitialization
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
+from naibu.imaging.volume_correlation.rigid_parts.rigid_initialization import RigidInitialization
 from naibu.imaging.volume_correlation.settings import CorrelationSettings
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 

@@ -16,7 +16,7 @@ from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
-from naibu.imaging.volume_correlation.rigid_inclusions import InclusionMotion, RigidInclusion
+from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import InclusionMotion, RigidInclusion
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 
 Array = np.ndarray

@@ -27,7 +27,7 @@ from naibu.imaging.large_volumes.summed_equations import Model, SummedEquations
 from naibu.imaging.large_volumes.thinning import COARSE_VOXELS, SMOOTHING, thinned, thinning_factor
 from naibu.imaging.volume_correlation.correlate import DEFAULT, Correlation
 from naibu.imaging.volume_correlation.image_level import ImageLevel
-from naibu.imaging.volume_correlation.result import CorrelationResult
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 from naibu.imaging.volume_correlation.settings import CorrelationSettings
 
 EDGE = 128  # voxels along a block, which take some 500 MB

@@ -20,7 +20,6 @@ from naibu.imaging.large_volumes.noise_tiles import NoiseTiles
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.object_mask import object_threshold
 from naibu.imaging.volume_correlation._spline_kernels import product
-from naibu.imaging.volume_correlation.block_displacements import BlockSums, block_edge, displacement_of_blocks
 from naibu.imaging.volume_correlation.common_content import content_of
 from naibu.imaging.volume_correlation.correlate import (
     ADAPTATION_SAMPLES,
@@ -35,7 +34,8 @@ from naibu.imaging.volume_correlation.gauss_newton import SAMPLE_TOLERANCE, SAMP
 from naibu.imaging.volume_correlation.image_level import GAIN_RANGE, GainMap, most_probable_gain
 from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
-from naibu.imaging.volume_correlation.result import CorrelationResult, collected
+from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, displacement_of_blocks
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
 
 # Gauss-Newton steps: the first of them with voxels of an edge in between, where there are such, and the one in which weights are adapted
 ROUGH_PASSES, ADAPTED_PASS, LEAST_PASSES, PASSES = 3, 5, 6, 8

@@ -28,17 +28,17 @@ from naibu.imaging.preprocessing.field_of_view import Box, fields_of_view, in_bo
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.preprocessing.volume_pair import intensity_pair
-from naibu.imaging.volume_correlation.block_displacements import block_displacements
 from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit, Iterations, cell_kinds, chosen_weights
 from naibu.imaging.volume_correlation.image_level import ImageLevel
-from naibu.imaging.volume_correlation.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
-from naibu.imaging.volume_correlation.result import CorrelationResult, collected
-from naibu.imaging.volume_correlation.rigid_inclusions import RigidInclusion, rigid_inclusions_among
-from naibu.imaging.volume_correlation.rigid_initialization import RigidInitialization, correlated_shift
+from naibu.imaging.volume_correlation.results.block_displacements import block_displacements
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
+from naibu.imaging.volume_correlation.rigid_parts.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
+from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion, rigid_inclusions_among
+from naibu.imaging.volume_correlation.rigid_parts.rigid_initialization import RigidInitialization, correlated_shift
 from naibu.imaging.volume_correlation.settings import REFERENCE_FRACTION, CorrelationSettings
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 

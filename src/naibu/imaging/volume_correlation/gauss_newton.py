@@ -19,7 +19,7 @@ from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
-from naibu.imaging.volume_correlation.rigid_inclusions import RigidInclusion
+from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion
 
 # relative accuracy of the linear solves: a Gauss-Newton step is repeated, a random field need not be more exact than it is random
 STEP_TOLERANCE, SAMPLE_TOLERANCE = 0.1, 0.06

@@ -17,7 +17,7 @@ from naibu.imaging.preprocessing.field_of_view import fields_of_view
 from naibu.imaging.preprocessing.intensity_parts import intensity_parts
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
-from naibu.imaging.volume_correlation.result import CorrelationResult
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 
 # empirical: fraction of the cells that one field leaves more than a voxel apart, above which parts are measured by themselves. Legs and
 # chests that move as one have none, lungs that slide by 17 mm along a wall without texture 0.05, those that slide by 20 mm 0.3

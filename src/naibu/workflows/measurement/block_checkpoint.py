@@ -181,7 +181,7 @@ def _raise_what_failed(_: int, outcome: Outcome) -> None:
 def _digest_of_code() -> str:
     """Return a digest of the modules that compute blocks: sums of another code must not be added to those of this one."""
     imaging = Path(large_volumes.__file__).parent.parent
-    files = sorted(file for room in ("large_volumes", "volume_correlation", "preprocessing") for file in (imaging / room).glob("*.py"))
+    files = sorted(file for room in ("large_volumes", "volume_correlation", "preprocessing") for file in (imaging / room).rglob("*.py"))
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()
 
 

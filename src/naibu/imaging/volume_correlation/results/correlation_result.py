@@ -14,7 +14,8 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
-from naibu.imaging.volume_correlation.cell_errors import (
+from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
+from naibu.imaging.volume_correlation.results.cell_errors import (
     BIAS_TOLERANCE,
     REMAINING,
     bias_variance,
@@ -23,8 +24,7 @@ from naibu.imaging.volume_correlation.cell_errors import (
     sampled_covariance,
     strain_variance,
 )
-from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
-from naibu.imaging.volume_correlation.rigid_inclusions import InclusionMotion
+from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import InclusionMotion
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable, separable_slice
 
 LEAST_KNOWN = 1e-4  # weight of the known cells about a voxel, from which it is interpolated among all voxels at once

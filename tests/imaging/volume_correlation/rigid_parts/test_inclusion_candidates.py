@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from naibu.core.volume import Volume
-from naibu.imaging.volume_correlation.inclusion_candidates import inclusion_candidates
+from naibu.imaging.volume_correlation.rigid_parts.inclusion_candidates import inclusion_candidates
 
 
 @pytest.mark.parametrize("voxel", [0.8, 2.0])

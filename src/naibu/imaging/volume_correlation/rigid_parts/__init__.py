@@ -1,0 +1,1 @@
+"""Rigid motion: of the whole before the fit, and of inclusions in it."""
