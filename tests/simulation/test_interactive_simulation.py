@@ -177,6 +177,7 @@ def test_frames_that_leave_their_step_to_the_next_come_to_the_same_states() -> N
                     assert frames[-1].number > before.number
                     assert frames[-1].time_s == before.time_s
                     assert frames[-1].positions is before.positions
+                    assert frames[-1].unbalanced == before.unbalanced
                 touched.move((20.0, 20.0, height))
         assert any(frame.under_way for frame in frames) == (budget == 0.0)
         ends.append([np.vstack([f.positions, f.force, f.tool_centre]) for f in frames if not f.under_way])

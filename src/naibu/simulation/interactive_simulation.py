@@ -327,11 +327,12 @@ class InteractiveSimulation:
             self._session.restore(before)
             self._target, self._rotation_target = self._centre, self._rotation
             self._pull_target = self._grip_position()
-            self._last = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, str(error))
+            again = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, str(error))
+            self._last = replace(again, unbalanced=self._last.unbalanced)
             return self._last
         if forces is None:
-            self._under_way, left = (centre, spin, gripped), self.body.unbalanced(self._session)
-            self._last = replace(self._last, number=self._last.number + 1, failed="", unbalanced=left, under_way=True)
+            self._under_way = (centre, spin, gripped)
+            self._last = replace(self._last, number=self._last.number + 1, failed="", under_way=True)
             return self._last
         way = centre - self._centre
         self._centre, self._rotation = centre, rotation_matrix(duration * spin) @ self._rotation
