@@ -32,6 +32,7 @@ from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
 from naibu.imaging.preprocessing.object_mask import mask_in_view, mask_jumps
 from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
+from naibu.imaging.preprocessing.volume_pair import require_known
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
@@ -148,8 +149,11 @@ def measure_displacement(
         )
     if method != "default":
         _require_measured(reference, deformed)
+    views = fields_of_view(reference, deformed)
+    for volume, view, name in zip((reference, deformed), views, ("reference", "deformed"), strict=True):
+        require_known(volume, view, name)
     if mask is None:
-        view = fields_of_view(reference, deformed)[0]
+        view = views[0]
         inside = mask_in_view(reference, view)
         doubts = _mask_doubts(inside)
         # the surface has much of the contrast
