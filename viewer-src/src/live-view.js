@@ -262,18 +262,31 @@ export class LiveView extends View {
     if (!this.markers.visible) return;
     const { nodes, weights, each } = this.scene.markers;
     const at = this.position.array;
-    const matrix = new Matrix4();
-    // a section is opaque: those within half their mean distance of it are seen on it, on either side
-    const box = this.high.map((v, a) => v - this.low[a]);
-    const slab = 0.5 * Math.cbrt((box[0] * box[1] * box[2]) / Math.max(this.markers.count, 1));
+    const places = Array.from({ length: this.markers.count }, (_, q) => {
+      const p = new Vector3();
+      for (let k = q * each; k < (q + 1) * each; k += 1) p.addScaledVector(new Vector3().fromArray(at, 3 * nodes[k]), weights[k]);
+      return p;
+    });
+    const ahead = this.clip ? places.map((p) => this.clip.distanceToPoint(p)) : [];
+    const reach = this.clip ? this.#reach(ahead) : Infinity;
     this.markers.material.depthTest = !this.clip;
-    for (let q = 0; q < this.markers.count; q += 1) {
-      const p = [0, 0, 0];
-      for (let k = q * each; k < (q + 1) * each; k += 1) for (let a = 0; a < 3; a += 1) p[a] += weights[k] * at[3 * nodes[k] + a];
-      const hidden = this.clip && Math.abs(this.clip.normal.x * p[0] + this.clip.normal.y * p[1] + this.clip.normal.z * p[2] + this.clip.constant) > slab;
-      this.markers.setMatrixAt(q, hidden ? matrix.makeScale(0, 0, 0) : matrix.makeTranslation(...p));
-    }
+    const matrix = new Matrix4();
+    places.forEach((p, q) => {
+      const hidden = this.clip && Math.abs(ahead[q]) > reach;
+      this.markers.setMatrixAt(q, hidden ? matrix.makeScale(0, 0, 0) : matrix.makeTranslation(p));
+    });
     this.markers.instanceMatrix.needsUpdate = true;
+  }
+
+  /**
+   * How far from a section, which is opaque, markers are seen on it, on either side: half their mean distance, and where it passes between
+   * them, as between the layers in which they were laid, as far as the nearest ones.
+   */
+  #reach(ahead) {
+    const box = this.high.map((v, a) => v - this.low[a]);
+    const half = 0.5 * Math.cbrt((box[0] * box[1] * box[2]) / Math.max(ahead.length, 1));
+    const [before, behind] = [1, -1].map((sign) => Math.min(...ahead.filter((v) => sign * v >= 0).map(Math.abs))); // Infinity: none
+    return Number.isFinite(before + behind) ? Math.max(half, Math.min(before, behind) + 0.5 * half) : half;
   }
 
   /** Cut the view by a plane across axis 0, 1 or 2 at a fraction of the object's extent; null shows everything. */

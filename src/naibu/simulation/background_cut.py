@@ -16,6 +16,7 @@ from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.simulation.interactive_bodies import FiniteElementBody
 
+CUT_STAGES = ("separating the mesh", "bringing volume strains to balance", "factorizing the stiffness", "lifting the tool")
 PART = 0.1  # of a step, in which volume strains come to balance
 
 
@@ -27,9 +28,12 @@ class BackgroundCut:
     ----------
     body : FiniteElementBody
         What is cut.
+    stage : int
+        Number in `CUT_STAGES` of what is being computed; the last one where that is done.
     """
 
     body: FiniteElementBody
+    stage: int = field(init=False, default=0)
     _made: tuple[FiniteElementBody, VolumeCut, FloatArray] | None = field(init=False, default=None)
     _failure: BaseException | None = field(init=False, default=None)
     _thread: threading.Thread | None = field(init=False, default=None)
@@ -66,26 +70,33 @@ class BackgroundCut:
     def _run(self, state: DynamicState, blade: SweptBlade, distance_mm: float | None) -> None:
         try:
             body, behind, found = self.body.cut(state, blade, distance_mm)
-            self._made = body, found, _settled(body, behind)
+            self.stage = 1
+            settled = _settled(body, behind)
+            self.stage = 2
+            _keep_tangent(body, settled)
+            self._made = body, found, settled - behind.displacement
         except BaseException as error:
             self._failure = error
+        self.stage = len(CUT_STAGES) - 1
 
 
 def _settled(body: FiniteElementBody, behind: DynamicState) -> FloatArray:
-    """Return the displacement (n, 3), mm, by which volume strains behind a cut come to balance, and keep the tangent there.
+    """Return the displacement (n, 3), mm, at which volume strains behind a cut have come to balance.
 
     The cut divides the patches over which volume strains are averaged: in a nearly incompressible body that makes large pressures, and a
     balance that the first frame behind the cut would take seconds to find. In a small part of a step, begun at rest, they vanish, while
     weight and other forces move the body by next to nothing.
     """
-    settled, still = behind.displacement, np.zeros_like(behind.velocity)
-    with suppress(NaibuError):  # whoever steps it next is told
-        with closing(replace(body, engine=replace(body.engine, step=PART * body.step_s)).session()) as session:
-            session.restore(DynamicState(settled, still))
-            session.step(body.grip_velocity(np.zeros(3)), [])
-            settled = session.state().displacement
-        with closing(body.session()) as session:
-            session.restore(DynamicState(settled, still))
-            if isinstance(session, RealTimeSession):
-                session.keep_tangent()
-    return np.asarray(settled - behind.displacement)
+    with suppress(NaibuError), closing(replace(body, engine=replace(body.engine, step=PART * body.step_s)).session()) as session:
+        session.restore(DynamicState(behind.displacement, np.zeros_like(behind.velocity)))
+        session.step(body.grip_velocity(np.zeros(3)), [])
+        return np.asarray(session.state().displacement)
+    return behind.displacement  # whoever steps it next is told
+
+
+def _keep_tangent(body: FiniteElementBody, settled: FloatArray) -> None:
+    """Keep the tangent at a displacement (n, 3), mm, for the sessions of a body."""
+    with suppress(NaibuError), closing(body.session()) as session:
+        session.restore(DynamicState(settled, np.zeros_like(settled)))
+        if isinstance(session, RealTimeSession):
+            session.keep_tangent()

@@ -122,6 +122,11 @@ class InteractiveSimulation:
         """The last frame."""
         return self._last
 
+    @property
+    def cut_stage(self) -> int:
+        """Number in `CUT_STAGES` of what is being done for the cut that was begun; -1 where none was, or it has opened."""
+        return self._cutting.stage if self._cutting else -1
+
     def take(self, tool: str) -> None:
         """Bring a tool into play, where it waits; an empty name puts the one in play away.
 
@@ -276,9 +281,7 @@ class InteractiveSimulation:
         if self._trapped and (cutting is None or cutting.finished):
             said, self._trapped, self._cutting = self._trapped, "", None
             raise InputError(said)
-        if cutting is None:
-            return False
-        if not cutting.finished or self._next is not None:
+        if cutting is None or not cutting.finished or self._next is not None:
             return False
         self._cutting = None
         if cutting.body is not self.body:
