@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from naibu.mechanics.contact.indenter_motion import IndenterVelocity
+from naibu.mechanics.contact.rigid_indenters import box_indenter, plane_indenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.cpu.implicit import coarse_space
-from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import _from_nodes, _to_nodes, gather, turn_with
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import _from_nodes, _to_nodes, add_contacts, gather, turn_with
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import multiply
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.octree import octree_lattice
@@ -152,6 +154,61 @@ def test_the_coarse_matrix_is_the_lattices_own(name, monkeypatch):
     energy = multiply(blocks, inner[0], inner[1], inner[2], p, q)
     shift = 1e-5 * (p.reshape(3, pad)[:, :n] ** 2 / smoother[:n]).sum()
     assert np.einsum("ai,aibj,bj", c, base, c) == pytest.approx(energy + shift, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", ["classic", "octree", "tetrahedra"])
+def test_what_contact_adds_to_the_coarse_matrix_is_the_product_of_its_own_with_coarse_functions(name, monkeypatch):
+    helped(monkeypatch)
+    lattice, parameters = SPECIMENS[name]
+    corner, weight = LatticeEngine.of(lattice, parameters).scratch.coarse[4][:2]
+    rng, count = np.random.default_rng(4), int(corner.max()) + 1
+    touched = rng.choice(lattice.n_nodes, 20, replace=False)
+    places = rng.permuted(np.tile(np.arange(20), (7, 1)), axis=1)[:, :4]
+    places[6, 3] = places[6, 2]  # a triangle
+    halves = rng.normal(size=(7, 12, 12))
+    blocks = np.zeros((9, 12, 16))
+    blocks[:7, :, :12] = halves @ halves.transpose(0, 2, 1)
+    full = np.zeros((3, 20, 3, 20))
+    for face, block in zip(places, blocks, strict=False):
+        for c, i in enumerate(face):
+            for e, j in enumerate(face):
+                full[:, i, :, j] += block[3 * c : 3 * c + 3, 3 * e : 3 * e + 3]
+    fraction = np.zeros((20, count))
+    np.add.at(fraction, (np.arange(20)[:, None], corner[touched]), weight[touched])
+    expected = np.einsum("ik,aibj,jl->akbl", fraction, full, fraction, optimize=True)
+    faces = touched[places]
+    dense, diagonal = np.zeros((3, count, 3, count)), np.zeros((3, count))
+    add_contacts((faces, blocks, len(faces)), corner, weight, dense, diagonal)
+    np.testing.assert_allclose(dense, expected, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(diagonal, np.einsum("akak->ak", expected), atol=1e-12 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize(("name", "between"), [("classic", False), ("classic", True), ("octree", False)])
+def test_a_body_on_a_floor_that_a_plate_drags_needs_fewer_iterations(name, between, monkeypatch):
+    """Contact is all that holds the body: coarse functions that did not know of it would not help. Results are those without them."""
+    lattice = SPECIMENS[name][0]
+    parameters = lattice_parameters(lattice, 40.0, 18.0, 1000.0)
+    low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
+    middle, wide = 0.5 * (low + high), 4.0 * float((high - low).max())
+    plate = box_indenter((middle[0], middle[1], high[2] + 2.0), (wide, wide, 4.0), static_friction=0.6, kinetic_friction=0.5)
+    bodies = (plane_indenter(low, (0.0, 0.0, 1.0), static_friction=0.6, kinetic_friction=0.5), plate)
+    path = np.zeros((12, 2, 3))
+    path[:, 1, 2], path[6:, 1, 0] = -20.0, 40.0
+    weight = np.outer(lattice.node_mass, (0.0, 0.0, -9810.0))
+
+    def moved():
+        engine = LatticeEngine.of(lattice, parameters, step=0.01, tolerance=1e-5)
+        session = engine.session(external_force=weight, indenters=bodies)
+        forces = [session.step(motions=[IndenterVelocity(tuple(v)) for v in velocity]).indenters[0] for velocity in path]
+        return session.positions(), np.array(forces), session.iterations
+
+    monkeypatch.setattr(coarse_space, "_FEW", np.inf)
+    position, force, plain = moved()
+    helped(monkeypatch, between)
+    ours, found, iterations = moved()
+    np.testing.assert_allclose(found, force, atol=2e-3 * np.abs(force).max())
+    np.testing.assert_allclose(ours, position, atol=2e-4 * np.abs(position - lattice.points).max())
+    assert iterations < 0.5 * plain
 
 
 @pytest.mark.parametrize("seed", range(30))

@@ -24,7 +24,7 @@ from naibu.mechanics.lattices.cpu._contact_solver import (
     solve_exactly,
     solve_roughly,
 )
-from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, begin_with, follow_contacts
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import add_momenta, add_reactions, advance
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import residual_norm
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR
@@ -47,7 +47,7 @@ def _slid_before(count, surface, history, lists, slid):  # type: ignore[no-untyp
             slid[p] = history[0][p] == SLIDE
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Solve a step until its contacts agree with the solution; return iterations, passes, what the solver lost, and whether they agree.
 
@@ -74,8 +74,9 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
             forget_impulses(operator, given)
             if not attempt:
                 floor = plain_residual(data, plain, origin)
-            assemble(count, step, surface, lists, points[0], given, operator)
+            assemble(count, step, surface, lists, points[0], given, operator, room[4])
             close_operator(operator, smoother, slot, diagonal)
+            follow_contacts(inner[8], smoother, data[0][6], (operator[0], operator[1], operator[5][FACES]), iterations)
             change_contacts(data, given, 1.0)
             if not attempt:
                 goal, share = extrapolate(data, ahead, tolerance, floor)
@@ -180,6 +181,8 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
                 v[a * pad + i] += trust[0] * change[a * pad + i]
         done, tries, lost, agreed, share = _settle((data, solver), found, (given, plain, origin), (change, trust[0]), inner[3], most)
         trust[0] = min(max(share, 0.0), 1.0)
+        if len(inner[8][5][2]):
+            inner[8][5][2][LATEST] = done
         for a in range(3):
             for i in range(trend.shape[1]):
                 trend[a, i] = (v[a * pad + i] - before[a * pad + i]) / step

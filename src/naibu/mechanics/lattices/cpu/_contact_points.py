@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import UNCOUNTED, njit
+from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import MESH, SPHERE, distance_from_primitive, mesh_of, signed_distance
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
@@ -34,7 +34,7 @@ NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, COLUMNS = 0, 3, 4, 7, 
 FORCE, TANGENT, ALONG, TOUCHING, OWN, UNDER, RESULTS = 0, 3, 6, 7, 8, 9, 10
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def near_faces(x, v, step, indenters, motion, surface, lists):  # type: ignore[no-untyped-def]  # pragma: no cover
     """List the faces that indenters may touch in this step, or that still hold what they left there; return how many there are.
 
@@ -133,11 +133,12 @@ def _combine(shape, values, out):  # type: ignore[no-untyped-def]  # pragma: no 
         out[a] = shape[0] * values[0, a] + shape[1] * values[1, a] + shape[2] * values[2, a] + shape[3] * values[3, a]
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def new_room():  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return small arrays for `look`."""
+    """Return small arrays for `look` and `assemble`."""
     nodes, vectors = np.empty((2, 4, 3)), np.empty((6, 3))
-    return (nodes[0], nodes[1]), np.empty(4), (vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5]), np.empty((0, 0))
+    across = (vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5])
+    return (nodes[0], nodes[1]), np.empty(4), across, np.empty((0, 0)), np.empty((3, 3))
 
 
 @njit(cache=True, **UNCOUNTED)
@@ -152,7 +153,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
     corners, _, foundation, shapes, weights, first, rule = surface
     _, _, compression, extension, traction, multiplier, thickness = history
     linear, found = points
-    (at, speed), share, (across, slip, d, q, m, n), none = room
+    (at, speed), share, (across, slip, d, q, m, n), none, _ = room
     wrong, wrong_friction, total, limits = 0.0, 0.0, 0.0, 0.0
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
@@ -351,14 +352,16 @@ def _return_mapping(own, traction, slip, stiff, pressure, friction, slid, p, res
     return np.sqrt(wrong)
 
 
-@njit(cache=True, fastmath={"contract", "nsz", "reassoc"})
-def assemble(count, step, surface, lists, linear, right, operator):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write the blocks of the faces with points in contact into the operator, and add their impulses to `right` (3 pad,)."""
+@njit(cache=True, fastmath={"contract", "nsz", "reassoc"}, **UNCOUNTED)
+def assemble(count, step, surface, lists, linear, right, operator, d):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Write the blocks of the faces with points in contact into the operator, and add their impulses to `right` (3 pad,).
+
+    `d` (3, 3) is scratch.
+    """
     corners, _, _, shapes, weights, first, rule = surface
     body, face = lists[0], lists[1]
     nodes, blocks, counts = operator[0], operator[1], operator[5]
     pad, used = len(right) // 3, 0
-    d = np.empty((3, 3))
     for entry in range(count):
         k, f = body[entry], face[entry]
         each, touched = rule[k + 1] - rule[k], False
@@ -386,7 +389,8 @@ def assemble(count, step, surface, lists, linear, right, operator):  # type: ign
                         for b in range(3):
                             block[3 * c + a, 3 * e + b] += both * d[a, b]
         if touched:
-            nodes[used] = corners[f]
+            for c in range(4):
+                nodes[used, c] = corners[f, c]
             for c in range(4):
                 for e in range(c):
                     for a in range(3):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, add_contact
+from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, ROOM, ROUGH_ROOM, add_contact
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import CREDIT
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import first_residual, settle
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import conjugate_gradients, multiply, project, residual_norm
@@ -42,7 +42,7 @@ def change_contacts(data, given, sign):  # type: ignore[no-untyped-def]  # pragm
         i = operator[3][c]
         for a in range(3):
             r[a * pad + i] += sign * given[a * pad + i]
-    add_contact(operator[0], operator[1], operator[5][FACES], -sign, v, r)
+    add_contact(operator[0], operator[1], operator[5][FACES], -sign, v, r, operator[ROOM])
 
 
 @njit(cache=True, **UNCOUNTED)
@@ -149,7 +149,7 @@ def _product(solver):  # type: ignore[no-untyped-def]  # pragma: no cover
     inner = solver[5]
     touched, along, product = inner[OPERATOR], inner[6], inner[POOL][3][0]
     curvature = share(solver, MULTIPLY, 0.0)
-    return curvature + add_contact(touched[0], touched[2], touched[5][FACES], 1.0, along, product)
+    return curvature + add_contact(touched[0], touched[2], touched[5][FACES], 1.0, along, product, touched[ROUGH_ROOM])
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)

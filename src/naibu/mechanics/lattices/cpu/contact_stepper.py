@@ -19,7 +19,8 @@ from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 from naibu.mechanics.lattices.cpu._contact_points import COLUMNS as POINT_COLUMNS
 from naibu.mechanics.lattices.cpu._contact_points import RESULTS, rest_at
 from naibu.mechanics.lattices.cpu.explicit_contact import ElementForces
-from naibu.mechanics.lattices.cpu.implicit._solver_parts import POOL
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, TOUCHED
+from naibu.mechanics.lattices.cpu.implicit._solver_parts import COARSE, POOL
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments
 from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitStepper
 from naibu.mechanics.lattices.model.contact_state import ContactState
@@ -179,6 +180,9 @@ class ContactStepper:
         known = self._arguments.get(parts)
         if known is None or known[0] is not base.constrained:
             (node, direction, _, body), (operator, *own), contact = base.constrained, self.scratch, self.contact
+            memory = base.scratch[1][COARSE][5][2]
+            if len(memory):  # a run does not depend on those before it
+                memory[[TOUCHED, LATEST]] = 0
             data = base.arguments(base.scratch[1][POOL], operator, (node, direction, np.zeros(len(node)), body))
             history = contact.history()
             corners, spread, *rest = self.points

@@ -8,12 +8,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import COUNTED, njit
+from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 from naibu._numba.simd import WIDTH, load, splat, store, total
 
 _FAST = {"contract", "nsz"}
-# places in the memory: constrained components known of, inverse in use, work done, and work from which on a new inverse costs little
-NODES, SLOT, CREDIT, PRICE = range(4)
+# places in the memory: constrained components known of, inverse in use, work done, and work from which on a new inverse costs little;
+# whether there is an inverse with contacts, and the work of the last step in contact
+NODES, SLOT, CREDIT, PRICE, TOUCHED, LATEST = range(6)
+PLAIN, HELD, CONTACT = range(3)  # inverses: without constrained components, with them, and with contacts too
+CHANGED = 0.3  # change of what contacts add, as a fraction of it, from which on an inverse is made anew
+FACES_PRICE = 0.125  # iterations that it takes to add a face to the matrix
+DEARER = 2.0  # how many times what an inverse costs the iterations of a step have to be, so that no short step takes much longer for it
 
 
 @njit(cache=True, fastmath=_FAST)
@@ -207,7 +212,7 @@ def add_constrained(constrained, smoother, corner, weight, dense, diagonal):  # 
                             dense[a, c, b, corner[i, q]] += along * weight[i, q] * direction[h, b]
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def _invert(a):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Turn a positive definite matrix, whose size is a multiple of eight, into its inverse, by sweeps."""
     n = len(a)
@@ -226,12 +231,102 @@ def _invert(a):  # type: ignore[no-untyped-def]  # pragma: no cover
                     store(other, j, load(other, j) - factor * load(own, j))
 
 
+@njit(cache=True)
+def add_contacts(operator, corner, weight, dense, diagonal):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add what contact adds to the matrix, as coarse functions see it, to `dense` (3, n, 3, n) and `diagonal` (3, n), as `assemble` does.
+
+    `operator` are nodes of faces (f, 4), their blocks (f, 12, 16), and how many faces there are.
+    """
+    corners, blocks, count = operator
+    node, fraction, half = np.empty(32, np.int64), np.empty((4, 32)), np.empty((12, 96))
+    for f in range(count):
+        found = 0
+        for c in range(4):
+            for k in range(8):
+                w = weight[corners[f, c], k]
+                if w == 0.0:
+                    continue
+                at, h = corner[corners[f, c], k], 0
+                while h < found and node[h] != at:
+                    h += 1
+                if h == found:
+                    node[h] = at
+                    for e in range(4):
+                        fraction[e, h] = 0.0
+                    found += 1
+                fraction[c, h] += w
+        block = blocks[f]
+        for row in range(12):
+            for h in range(found):
+                for b in range(3):
+                    s = 0.0
+                    for e in range(4):
+                        s += block[row, 3 * e + b] * fraction[e, h]
+                    half[row, 3 * h + b] = s
+        for h in range(found):
+            for a in range(3):
+                for k in range(found if dense.size else 0):
+                    for b in range(3):
+                        s = 0.0
+                        for c in range(4):
+                            s += fraction[c, h] * half[3 * c + a, 3 * k + b]
+                        dense[a, node[h], b, node[k]] += s
+                if diagonal.size:
+                    for c in range(4):
+                        diagonal[a, node[h]] += fraction[c, h] * half[3 * c + a, 3 * h + a]
+
+
+@njit(cache=True, **UNCOUNTED)
+def _shares(operator, corner, weight, shares):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set `shares` (n,) to what contact adds to the diagonal of the matrix, divided among coarse functions."""
+    corners, blocks, count = operator
+    shares[:] = 0.0
+    for f in range(count):
+        for c in range(4):
+            own = blocks[f, 3 * c, 3 * c] + blocks[f, 3 * c + 1, 3 * c + 1] + blocks[f, 3 * c + 2, 3 * c + 2]
+            for k in range(8):
+                shares[corner[corners[f, c], k]] += weight[corners[f, c], k] * own
+
+
 @njit(cache=True, **COUNTED)
-def build(coarse, smoother, constrained, slot):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Invert the coarse matrix while components are constrained, into a slot."""
+def follow_contacts(coarse, smoother, constrained, operator, work):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Make the inverse one that knows what contacts add, anew where these have changed much and that pays.
+
+    It pays where the iterations of this step so far, `work`, or those of the step before are several times what an inverse costs.
+    `operator` is as in `add_contacts`.
+    """
+    corner, weight, (_, _, state, shares) = coarse[4][0], coarse[4][1], coarse[5]
+    if not len(state):
+        return
+    dear = max(work, state[LATEST]) >= DEARER * (state[PRICE] + FACES_PRICE * operator[2])
+    if operator[2] == 0 or not (state[TOUCHED] or dear):
+        state[SLOT] = HELD if len(constrained[0]) and _knows(coarse[5], constrained) else PLAIN
+        return
+    _shares(operator, corner, weight, shares[1])
+    changed, least = 0.0, 0.0
+    for h in range(shares.shape[1]):
+        changed += abs(shares[1, h] - shares[0, h])
+        least += min(shares[1, h], shares[0, h])
+    if dear and not (state[TOUCHED] and changed <= CHANGED * least):
+        build(coarse, smoother, constrained, operator, CONTACT)
+        shares[0] = shares[1]
+        state[TOUCHED] = 1
+    state[SLOT] = CONTACT if state[TOUCHED] else PLAIN
+
+
+@njit(cache=True, **COUNTED)
+def no_contacts():  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return what `add_contacts` takes where nothing is touched."""
+    return np.zeros((0, 4), np.int64), np.zeros((0, 12, 12)), 0
+
+
+@njit(cache=True, **COUNTED)
+def build(coarse, smoother, constrained, operator, slot):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Invert the coarse matrix while components are constrained and faces are touched, into a slot; `operator` is as in `add_contacts`."""
     _, _, _, (base, scale, diagonal, inverse), (corner, weight, fine_corner, fine_weight), _ = coarse
     dense, nothing, flat = base.copy(), np.zeros((0, 0, 0, 0)), np.zeros((0, 0))
     add_constrained(constrained, smoother, corner, weight, dense, flat)
+    add_contacts(operator, corner, weight, dense, flat)
     square = dense.reshape(inverse.shape[1:])
     _invert(square)
     for i in range(len(square)):
@@ -240,6 +335,7 @@ def build(coarse, smoother, constrained, slot):  # type: ignore[no-untyped-def] 
     if diagonal.size:
         fine = diagonal.copy()
         add_constrained(constrained, smoother, fine_corner, fine_weight, nothing, fine)
+        add_contacts(operator, fine_corner, fine_weight, nothing, fine)
         for i in range(fine.shape[1]):  # half, since the levels above and below see part of it as well
             scale[slot, i] = 1.5 / (fine[0, i] + fine[1, i] + fine[2, i])
 
@@ -248,14 +344,14 @@ def build(coarse, smoother, constrained, slot):  # type: ignore[no-untyped-def] 
 def begin(coarse):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Drop the constraints of the last run, so that a run does not depend on those before it."""
     if len(coarse[5][2]):
-        coarse[5][2][SLOT] = 0
+        coarse[5][2][SLOT] = PLAIN
         coarse[5][2][CREDIT] = 0
 
 
 @njit(cache=True)
 def _knows(memory, constrained):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return whether the second inverse is that for these constrained components."""
-    node, direction, state = memory
+    node, direction, state, _ = memory
     if state[NODES] != len(constrained[0]):
         return False
     for h in range(len(constrained[0])):
@@ -274,24 +370,24 @@ def follow(coarse, smoother, constrained, at_once):  # type: ignore[no-untyped-d
     Until then the one in use goes on; it is only slower.
     """
     memory = coarse[5]
-    node, direction, state = memory
+    node, direction, state, _ = memory
     if not len(state):
         return
     if len(constrained[0]) == 0:
-        state[SLOT] = 0
+        state[SLOT] = PLAIN
         return
-    if state[SLOT] == 1 and _knows(memory, constrained):
+    if state[SLOT] == HELD and _knows(memory, constrained):
         return
     if not at_once and state[CREDIT] < state[PRICE]:
         return
     if not _knows(memory, constrained):
-        build(coarse, smoother, constrained, 1)
+        build(coarse, smoother, constrained, no_contacts(), HELD)
         state[NODES] = len(constrained[0])
         for h in range(len(constrained[0])):
             node[h] = constrained[0][h]
             for a in range(3):
                 direction[h, a] = constrained[1][h, a]
-    state[SLOT], state[CREDIT] = 1, 0
+    state[SLOT], state[CREDIT] = HELD, 0
 
 
 @njit(cache=True, **COUNTED)

@@ -20,7 +20,7 @@ import numpy as np
 from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 from naibu._numba.simd import WIDTH, load, splat, store
 from naibu._numba.thread_pool import begin_step, end_step
-from naibu.mechanics.lattices.cpu._contact_operator import FACES, add_contact
+from naibu.mechanics.lattices.cpu._contact_operator import FACES, ROOM, add_contact
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with, follow
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import dot, solve
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import ALIGN, CHANGE, FURTHER, MULTIPLY_FULL, NORM, OPERATOR, POOL, share, summed
@@ -96,7 +96,7 @@ def settle(data):  # type: ignore[no-untyped-def]  # pragma: no cover
             p[i] = v[i] - q[i]
         lost = dot(p, r)
     curvature = share(solver, MULTIPLY_FULL, 0.0)
-    curvature += add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, full[0])
+    curvature += add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, full[0], touched[ROOM])
     fraction = lost / curvature if curvature > 0.0 else 0.0
     numbers[FURTHER] = fraction
     share(solver, CHANGE, fraction)
@@ -125,7 +125,7 @@ def first_residual(data):  # type: ignore[no-untyped-def]  # pragma: no cover
     heaviest = 0.0
     for c in range(len(sums)):
         heaviest = max(heaviest, sums[c, 0])
-    add_contact(touched[0], touched[1], touched[5][FACES], -1.0, v, r)
+    add_contact(touched[0], touched[1], touched[5][FACES], -1.0, v, r, touched[ROOM])
     share_step(data, PREPARE, 0.0)
     strength = summed(sums, 0)
     inner[POOL][5][FURTHER] = 0.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
 from naibu._numba.simd import WIDTH, load, splat, total
-from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, add_contact, add_preconditioned, extra_energy
+from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, ROOM, add_contact, add_preconditioned, extra_energy
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import CREDIT, correct
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import (
     BEGIN,
@@ -69,7 +69,7 @@ def conjugate_gradients(solver, unit, goal, limit, helped):  # type: ignore[no-u
     Coarse functions are used if `helped`. Returns the number of iterations and whether the goal was reached or the limit.
     """
     inner, constrained = solver[5], solver[6]
-    _, _, light, _, _, r, p, _, coarse, (corners, _, rough, nodes, inverse, counts), pool = inner
+    _, _, light, _, _, r, p, _, coarse, (corners, _, rough, nodes, inverse, counts, _, room), pool = inner
     pad = len(light)
     pool[5][HELPED] = 1.0 if helped else 0.0
     norm = share(solver, BEGIN, 1.0 / unit)
@@ -91,7 +91,7 @@ def conjugate_gradients(solver, unit, goal, limit, helped):  # type: ignore[no-u
             project(constrained, p, pad)
         curvature = share(solver, MULTIPLY, 0.0)
         if counts[FACES]:
-            curvature += add_contact(corners, rough, counts[FACES], 1.0, p, pool[3][0])
+            curvature += add_contact(corners, rough, counts[FACES], 1.0, p, pool[3][0], room)
         if not curvature > 0.0:
             return count, False
         norm = share(solver, DESCEND, energy / curvature)
@@ -117,7 +117,7 @@ def solve(solver, goal, limit):  # type: ignore[no-untyped-def]  # pragma: no co
         count, helped = count + done, helped and well
         share(solver, CORRECT, unit)
         share(solver, MULTIPLY_FULL, 0.0)
-        add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, full[0])
+        add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, full[0], touched[ROOM])
         inner[POOL][5][FURTHER] = 0.0
         share(solver, CHANGE, 1.0)
         norm = share(solver, NORM, 0.0)

@@ -23,7 +23,7 @@ SOLVER_JOBS = 9
 # typed numbers, or Numba would compile what takes a job once for each; coarse functions gather the residual after the first two
 DESCEND, BEGIN, TURN, MULTIPLY, CORRECT, MULTIPLY_FULL, CHANGE, NORM, ALIGN = np.arange(SOLVER_JOBS, dtype=np.int64)
 FACTOR, FURTHER, HELPED = range(3)  # places of the numbers for all
-OPERATOR, POOL = 9, 10  # places in `inner`
+COARSE, OPERATOR, POOL = 8, 9, 10  # places in `inner`
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)

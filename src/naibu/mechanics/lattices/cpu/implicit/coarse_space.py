@@ -3,7 +3,9 @@
 Neighbours pass a residual on slowly; coarse functions spread it over the lattice at once.
 Hat functions of a grid over the lattice at rest, linear in x, y and z, take the residual of the nodes to few coarse nodes, where a small
 matrix is inverted, and its solution back. The matrix is that of the lattice at rest, in which components that are constrained count as if
-their nodes hung on springs as stiff as all their elements. It is only a preconditioner: where the lattice has turned or is constrained
+their nodes hung on springs as stiff as all their elements. Where steps take many iterations, what contacts add to the matrix of the step is
+added as coarse functions see it (Galerkin's way): a body that lies on a floor is held by nothing else, and its rigid motion would be the
+slowest of all to settle. It is only a preconditioner: where the lattice has turned, or is constrained or touched
 elsewhere than it knows of, the solver takes more iterations, nothing else. On large lattices a grid between the nodes and the coarse one is
 added, of which only the diagonal is used. Positions are all that is needed, so that every mask, octree or mesh will do.
 """
@@ -15,7 +17,7 @@ import numpy as np
 from naibu._numba.packed_tuples import packed
 from naibu._numba.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
-from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import NODES, PRICE, assemble, build
+from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import NODES, PLAIN, PRICE, assemble, build, no_contacts
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple
 from naibu.mechanics.lattices.model.lattice import Lattice
 
@@ -53,9 +55,10 @@ def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoo
         Steps from the nodes to the nodes of a grid: lanes from nodes to columns of nodes along z, lanes from these to lines along x, and
         shares from lines to nodes. Their vectors: columns of every part, what goes back to them, lines, and right sides and values of
         nodes. Steps and vectors from that grid to a coarser one, if there are two. Matrix without constrained components (3, n, 3, n);
-        inverse diagonal of the finer grid twice, its diagonal; inverse of the matrix twice: without constrained components and with those
-        last constrained. Nodes (n, 8) and weights of every node on the coarser grid and on the finer one. Memory: constrained nodes and
-        directions, and the numbers of `lattice_coarse_kernels`.
+        inverse diagonal of the finer grid three times, its diagonal; inverse of the matrix three times: without constrained components,
+        with those last constrained, and with contacts too. Nodes (n, 8) and weights of every node on the coarser grid and on the finer one.
+        Memory: constrained nodes and directions, the numbers of `lattice_coarse_kernels`, and how much contacts add at the coarse nodes
+        (2, n), to the inverse and at present.
     """
     if lattice.n_elements < _FEW or lattice.node_mass.sum() > _WORTH * diagonal.sum():
         return no_coarse_space()
@@ -81,16 +84,16 @@ def coarse_space(lattice: Lattice, stiff: FloatArray, diagonal: FloatArray, smoo
         further = _steps(nodes / between, cells, used, -(-len(nodes) // WIDTH) * WIDTH, 1)
     small = (
         base,
-        aligned((2, -(-fine_diagonal.shape[1] // WIDTH) * WIDTH), np.float32),
+        aligned((3, -(-fine_diagonal.shape[1] // WIDTH) * WIDTH), np.float32),
         fine_diagonal,
-        aligned((2, 3 * wide, 3 * wide), np.float32),
+        aligned((3, 3 * wide, 3 * wide), np.float32),
     )
-    state = np.zeros(4, dtype=np.int64)
+    state = np.zeros(6, dtype=np.int64)
     state[NODES], state[PRICE] = -1, _PRICE * wide**3 // lattice.n_elements
-    memory = (np.zeros(3 * lattice.n_nodes, np.int64), np.zeros((3 * lattice.n_nodes, 3)), state)
+    memory = (np.zeros(3 * lattice.n_nodes, np.int64), np.zeros((3 * lattice.n_nodes, 3)), state, np.zeros((2, wide)))
     coarse = (*_steps(place, between * cells, fine[2], pad, parts), further, small, (corner, weight, *fine[:2]), memory)
     free = packed(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.int64))
-    build(packed(*coarse), smoother, free, 0)
+    build(packed(*coarse), smoother, free, no_contacts(), PLAIN)
     return coarse
 
 
@@ -221,6 +224,6 @@ def no_coarse_space() -> KernelTuple:
     """Return the arrays of no coarse correction."""
     steps, vectors = _steps(np.zeros((0, 3)), np.ones(3, dtype=np.int64), np.zeros(1, dtype=np.int64), 0, 1)
     single, whole, square = np.float32, np.zeros(0, np.int64), np.zeros((0, 8), np.int64)
-    small = (np.zeros((3, 0, 3, 0)), np.zeros((2, 0), single), np.zeros((3, 0)), np.zeros((2, 0, 0), single))
+    small = (np.zeros((3, 0, 3, 0)), np.zeros((3, 0), single), np.zeros((3, 0)), np.zeros((3, 0, 0), single))
     weights = (square, square + 0.0, square, square + 0.0)
-    return steps, vectors, (steps, vectors), small, weights, (whole, np.zeros((0, 3)), whole)
+    return steps, vectors, (steps, vectors), small, weights, (whole, np.zeros((0, 3)), whole, np.zeros((2, 0)))
