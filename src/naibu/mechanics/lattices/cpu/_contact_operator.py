@@ -81,7 +81,9 @@ def close_operator(operator, smoother, slot, diagonal):  # type: ignore[no-untyp
     corners, blocks, rough, nodes, inverse, counts = operator
     found = 0
     for f in range(counts[FACES]):
-        rough[f] = blocks[f]
+        for k in range(12):  # one by one: the first assignment of arrays takes Numba a second to compile
+            for m in range(12):
+                rough[f, k, m] = blocks[f, k, m]
         for k in range(4):
             i = corners[f, k]
             if slot[i] < 0:
