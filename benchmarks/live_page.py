@@ -1,9 +1,10 @@
 """Frames a second and delay of the live page in headless Chromium with software rendering, for surfaces of several sizes.
 
 A server shows a sphere that breathes 60 times a second, as a simulation would; the page draws it, with the finest picture that
-there is time for. Printed are vertices and pixels (a side, for one of the screen) that are drawn in motion, frames drawn a second,
-and the time from a command of the page (the tool is moved) to the animation frame after the one that drew its effect: the browser
-has composed the picture then. Chromium is started as on a computer without a graphics card, where it draws WebGL with SwiftShader
+there is time for. Printed are vertices and pixels (a side, for one of the screen) that are drawn in motion, frames drawn a second, the
+same while a hand leads the tool in a circle and the camera goes round the body, the processor time of the browser's processes for a frame
+of that motion, and the time from a command of the page (the tool is moved) to the animation frame after the one that drew its effect: the
+browser has composed the picture then. Chromium is started as on a computer without a graphics card, where it draws WebGL with SwiftShader
 and composes the page itself.
 
 Run: ``python benchmarks/live_page.py [--vertices 5000 50000] [--seconds 5] [--record]``
@@ -12,6 +13,7 @@ Run: ``python benchmarks/live_page.py [--vertices 5000 50000] [--seconds 5] [--r
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import threading
 import time
@@ -32,7 +34,24 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "helpe
 from browser import OPTIONS, opened_browser
 
 RADIUS = 40.0
-COLUMNS = ("vertices", "drawn in motion", "pixels a side", "frames drawn a second", "delay, median, ms", "delay, 95 %, ms")
+COLUMNS = (
+    "vertices", "drawn in motion", "pixels a side", "frames drawn a second", "in circles", "processor ms a frame",
+    "delay, median, ms", "delay, 95 %, ms",
+)  # fmt: skip
+CIRCLE = """(() => {
+  const { view } = naibuLive;
+  let before = performance.now();
+  const led = () => {
+    if (!window.circling) return;
+    const now = performance.now();
+    naibuLive.command("move", { at: [30 * Math.cos(now / 500), 30 * Math.sin(now / 500), 60] });
+    view.turn((now - before) / 2000, 0);
+    before = now;
+    requestAnimationFrame(led);
+  };
+  window.circling = true;
+  requestAnimationFrame(led);
+})()"""
 COUNTED = """(async () => {
   const frames = () => naibuLive.view.renderer.info.render.frame;
   const [began, first] = [performance.now(), frames()];
@@ -53,6 +72,7 @@ DELAY = """new Promise((done) => {
   const again = view.setFrame;
   naibuLive.command("move", { at: [0, 0, height] });
 })"""
+FRAMES = "naibuLive.view.renderer.info.render.frame"
 DRAWN = "[new Set(naibuLive.view.skin.geometry.index.array).size, naibuLive.view.canvas.width / naibuLive.view.canvas.clientWidth]"
 RENDERER = """(() => {
   const gl = naibuLive.view.renderer.getContext();
@@ -122,7 +142,29 @@ class Breathing:
         return ""
 
 
-def measured(vertices: int, seconds: float, moves: int) -> tuple[tuple[int, int, float, float, int, int], str]:
+def processor_s(roots: set[int]) -> float:
+    """Processor time of these processes and all that they started, s."""
+    spent, parent = {}, {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            numbers = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # it has ended
+            continue
+        number = int(stat.parent.name)
+        parent[number], spent[number] = int(numbers[1]), (int(numbers[11]) + int(numbers[12])) / os.sysconf("SC_CLK_TCK")
+    own = set(roots)
+    while more := {number for number, by in parent.items() if by in own} - own:
+        own |= more
+    return sum(spent.get(number, 0.0) for number in own)
+
+
+def children() -> set[int]:
+    """Processes that this one has started."""
+    found = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    return {int(number) for number in found}
+
+
+def measured(vertices: int, seconds: float, moves: int) -> tuple[tuple[int, int, float, float, float, float, int, int], str]:
     """A row of the table, and what draws."""
     points, faces = sphere(vertices)
     ball = RigidShape("sphere", "sphere", np.array([8.0, 0.0, 0.0]), np.eye(3))
@@ -139,6 +181,11 @@ def measured(vertices: int, seconds: float, moves: int) -> tuple[tuple[int, int,
             page.wait("document.querySelector('.stage[data-ready]') !== null", 60)
             time.sleep(SETTLED_S)
             rate = page.value(COUNTED % int(1e3 * seconds))
+            page.value(CIRCLE)
+            began, spent = page.value(FRAMES), processor_s(children())
+            circling = page.value(COUNTED % int(1e3 * seconds))
+            each = 1e3 * (processor_s(children()) - spent) / (page.value(FRAMES) - began)
+            page.value("window.circling = false")
             delays = np.array([page.value(DELAY) for _ in range(moves)])
             drawn, pixels = page.value(DRAWN)
             renderer = page.value(RENDERER)
@@ -146,7 +193,7 @@ def measured(vertices: int, seconds: float, moves: int) -> tuple[tuple[int, int,
         server.should_exit = True
         thread.join(timeout=10)
     median, late = (round(float(np.quantile(delays, q))) for q in (0.5, 0.95))
-    return (len(points), drawn, round(pixels, 2), round(rate, 1), median, late), renderer
+    return (len(points), drawn, round(pixels, 2), round(rate, 1), round(circling, 1), round(each, 1), median, late), renderer
 
 
 def main() -> None:

@@ -161,6 +161,52 @@ def test_a_step_that_fails_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> Non
     np.testing.assert_array_equal(frame.positions, good.positions)
 
 
+@pytest.mark.parametrize("kind", ["lattice", "gel"])
+def test_a_body_of_which_two_steps_fail_one_after_the_other_is_stopped_and_that_is_said(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    touched = InteractiveSimulation(lattice_or_gel(kind), {"sphere": spherical_indenter((20.0, 20.0, 60.0), 8.0)})
+    touched.take("sphere")
+    touched.move((20.0, 20.0, TOP + 4.0))
+    for _ in range(60):
+        good = touched.advance()
+        if np.abs(touched._session.state().velocity).max() > 1.0:
+            break
+    assert good.force[2] < 0.0
+
+    def fails(*_: object, **__: object) -> None:
+        raise ConvergenceError("no balance")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(type(touched._session), "step", fails)
+        first = touched.advance()
+        assert np.abs(touched._session.state().velocity).max() > 1.0 and "stopped" not in first.failed
+        second = touched.advance()
+        loop = RealTimeLoop(touched)
+        loop._advance(0.0)
+        assert loop.trouble() == second.failed and loop.trouble() == ""  # the page says it, once
+    assert second.failed == "no balance; the body was stopped where it was"
+    np.testing.assert_array_equal(second.positions, good.positions)
+    np.testing.assert_array_equal(touched._session.state().velocity, 0.0)
+    assert not touched.advance().failed
+    touched.close()
+
+
+def test_newtons_method_gives_up_a_step_that_a_loop_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without quasi-Newton iterations and with no time for Newton's method; a step that nobody waits for is taken to its end."""
+    monkeypatch.setattr("naibu.mechanics.finite_strain.sessions.real_time_session.NEWTON_S", 0.0)
+    monkeypatch.setattr(RealTimeSession, "_gone_on", lambda *_: None)
+    ends = []
+    for budget in (np.inf, 0.01):
+        touched = InteractiveSimulation(lattice_or_gel("gel"), {"sphere": spherical_indenter((20.0, 20.0, 60.0), 8.0)}, budget_s=budget)
+        touched.take("sphere")
+        touched.move((20.0, 20.0, TOP + 5.0))
+        for _ in range(4):
+            frame = touched.advance()
+        ends.append(frame)
+        touched.close()
+    assert not ends[0].failed and ends[0].time_s == pytest.approx(4 / 60)
+    assert "finds no balance" in ends[1].failed and ends[1].time_s == 0.0
+
+
 def test_frames_that_leave_their_step_to_the_next_come_to_the_same_states() -> None:
     ends = []
     for budget in (np.inf, 0.0):

@@ -71,6 +71,9 @@ class InteractiveBody(Protocol):
     def without_contact(self, state: Any) -> Any:
         """Return a copy of a state that no indenter touches."""
 
+    def at_rest(self, state: Any) -> Any:
+        """Return a copy of a state that does not move."""
+
     def cut(self, state: Any, blade: SweptBlade, distance_mm: float | None = None) -> tuple[InteractiveBody, Any, VolumeCut | LatticeCut]:
         """Return the body and its state behind a cut; by default as near to the blade as the body's cells suggest."""
 
@@ -147,6 +150,10 @@ class LatticeBody:
     def without_contact(self, state: LatticeState) -> LatticeState:
         """Return a copy of a state that no indenter touches."""
         return replace(state, contact=None)
+
+    def at_rest(self, state: LatticeState) -> LatticeState:
+        """Return a copy of a state that does not move."""
+        return replace(state, velocity=np.zeros_like(state.velocity))
 
     def cut(self, state: LatticeState, blade: SweptBlade, distance_mm: float | None = None) -> tuple[LatticeBody, LatticeState, LatticeCut]:
         """Return the lattice and its state behind a cut along the faces of its cubes; see `naibu.simulation.cut_lattice`.
@@ -322,6 +329,10 @@ class FiniteElementBody:
     def without_contact(self, state: DynamicState) -> DynamicState:
         """Return a copy of a state that no indenter touches."""
         return DynamicState(state.displacement, state.velocity)
+
+    def at_rest(self, state: DynamicState) -> DynamicState:
+        """Return a copy of a state that does not move."""
+        return replace(state, velocity=np.zeros_like(state.velocity))
 
     def cut(
         self, state: DynamicState, blade: SweptBlade, distance_mm: float | None = None

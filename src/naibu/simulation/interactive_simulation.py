@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from naibu.core.arrays import BoolArray, FloatArray, IntArray, as_vector, require_positive
+from naibu.core.arrays import FloatArray, IntArray, as_vector, require_positive
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.rigid_transform import rotation_between, rotation_matrix
 from naibu.mechanics.contact.indenter_motion import IndenterVelocity
@@ -87,6 +87,7 @@ class InteractiveSimulation:
     _cutting: BackgroundCut | None = field(init=False, default=None)
     _next: str | None = field(init=False, default=None)  # tool that is taken when the one in play has left the body
     _leaving: int = field(init=False, default=0)  # frames in which it was led away
+    _failures: int = field(init=False, default=0)  # of the last frames, one after the other
     _trapped: str = field(init=False, default="")  # what is to be said of a tool that did not leave the body
     _under_way: tuple[FloatArray, FloatArray, FloatArray] | None = field(init=False, default=None)  # motion of a step begun
 
@@ -193,7 +194,7 @@ class InteractiveSimulation:
         self._keep()
         near = np.linalg.norm(self.body.points - self.body.points[node], axis=1) <= max(radius_mm, 0.0)
         near[node] = True
-        self._nodes, self._gripped = np.flatnonzero(near & self._on_surface()).astype(np.int64), node
+        self._nodes, self._gripped = np.intersect1d(np.flatnonzero(near), self._surface).astype(np.int64), node
         self._pull_target, self._under_way = self._session.positions([node])[0], None
         self.body.grip(self._session, self._nodes)
 
@@ -316,6 +317,7 @@ class InteractiveSimulation:
     def advance(self) -> Frame:
         """Take the steps of one frame, and return it; a step that fails is taken back, and the frame says why.
 
+        Where the next one fails too, the body is stopped where it was, and the frame says so.
         A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was when the step began.
         """
         self._leave()
@@ -327,17 +329,20 @@ class InteractiveSimulation:
         try:
             forces = self.body.step(self._session, self.body.grip_velocity(gripped / duration), motions, self.steps, self.budget_s)
         except ConvergenceError as error:
+            self._failures, said = self._failures + 1, str(error)
+            if self._failures > 1:  # where it moves on to is what has no balance
+                before, said = self.body.at_rest(before), f"{said}; the body was stopped where it was"
             self._session.restore(before)
             self._target, self._rotation_target = self._centre, self._rotation
             self._pull_target = self._grip_position()
-            again = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, str(error))
+            again = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, said)
             self._last = replace(again, unbalanced=self._last.unbalanced)
             return self._last
         if forces is None:
             self._under_way = (centre, spin, gripped)
             self._last = replace(self._last, number=self._last.number + 1, failed="", under_way=True)
             return self._last
-        way = centre - self._centre
+        way, self._failures = centre - self._centre, 0
         self._centre, self._rotation = centre, rotation_matrix(duration * spin) @ self._rotation
         force = forces.indenters[:, -1].mean(axis=0) if self._tool else np.zeros(3)
         pull = forces.bodies[:, 1].mean(axis=0) if self._gripped >= 0 else np.zeros(3)
@@ -424,11 +429,6 @@ class InteractiveSimulation:
 
     def _grip_position(self) -> FloatArray:
         return self._pull_target if self._gripped < 0 else self._session.positions([self._gripped])[0]
-
-    def _on_surface(self) -> BoolArray:
-        marked = np.zeros(len(self.body.points), dtype=bool)
-        marked[self._surface] = True
-        return marked
 
     def _within(self, position: FloatArray) -> FloatArray:
         middle = 0.5 * (self.body.points.min(axis=0) + self.body.points.max(axis=0))

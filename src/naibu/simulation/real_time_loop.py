@@ -120,7 +120,7 @@ class RealTimeLoop:
         return self._latest, self._pace
 
     def trouble(self) -> str:
-        """Return what was wrong with the last command that failed, once."""
+        """Return what was wrong with the last command or step that failed, once."""
         said, self._trouble = self._trouble, ""
         return said
 
@@ -178,7 +178,7 @@ class RealTimeLoop:
         if hand is not None:
             hand.before(simulation)
         frame = simulation.advance()
-        self._under_way = frame.under_way
+        self._under_way, self._trouble = frame.under_way, frame.failed or self._trouble
         if hand is not None:
             hand.after(frame, simulation.frame_s)
         self._finished.append((self.clock(), 0.0 if frame.failed or frame.under_way else simulation.frame_s))

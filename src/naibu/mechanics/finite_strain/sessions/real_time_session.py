@@ -14,9 +14,11 @@ from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
 from naibu.mechanics.contact.indenter_motion import IndenterMotion, harmless_ways, parts_of_approach, slow_enough
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
@@ -27,6 +29,7 @@ from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_po
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
+from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import changing_lips
 from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel
 from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
@@ -39,6 +42,7 @@ USUAL = 3  # of a step whose balance is then passable
 DEPTH = 4  # earlier iterations that are mixed
 ACCEPTED = 0.06  # of a step that has used up its iterations; where it was 0.2, some later steps found no balance and took seconds
 BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is taken; one that is worse goes on, and real time is lost
+NEWTON_S = 10.0  # of a processor for Newton's method in a step that a loop waits for
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
 FURTHER, NEARER = 5, 0.7  # more of them, where the others reduced the error to so much of what it was before
 FEW = 200  # nodes of contact at most with which they cost less than a tangent of the step's own
@@ -104,6 +108,7 @@ class RealTimeSession(TangentSession):
     _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
     _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
     _search: Generator[None, None, Trial | None] | None = field(init=False, default=None)  # of the step under way
+    _newton_until: float = field(init=False, default=np.inf)  # processor time at which Newton's method gives a step up
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Bring these indenters, and no others, into play; see `DynamicSession.press`."""
@@ -130,7 +135,8 @@ class RealTimeSession(TangentSession):
     def step_within(self, budget_s: float, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = ()) -> StepForces | None:
         """Take a step, or work on it for about a time of the processor; None: call again, with the same motions, to go on with it.
 
-        The state is that before the step until its balance is found. Newton's method, where it is needed, is not divided.
+        The state is that before the step until its balance is found. Newton's method, where it is needed, is not divided; after `NEWTON_S`
+        the step fails as one does that has no balance.
         """
         self._until = time.thread_time() + budget_s
         try:
@@ -166,8 +172,17 @@ class RealTimeSession(TangentSession):
             if self._trial is not None:
                 return self._trial.displacement
             self.newton_steps += 1
+            self._newton_until = time.thread_time() + NEWTON_S if self._until < np.inf else np.inf
         self._pressure, self._trial, self._near, self._gaps = None, None, (), ()
         return DynamicSession._balanced(self, h, moving, contacts)
+
+    def _found(self, step: ImplicitStep, guess: FloatArray) -> FloatArray | None:
+        return None if time.thread_time() > self._newton_until else DynamicSession._found(self, step, guess)
+
+    def _solved(self, matrix: sp.bsr_matrix, residual: FloatArray) -> FloatArray:
+        if time.thread_time() > self._newton_until:
+            raise ConvergenceError("Newton's method takes longer than a step may")
+        return DynamicSession._solved(self, matrix, residual)
 
     def _gone_on(self, search: Generator[None, None, Trial | None]) -> Trial | None:
         """Return what a search finds; where it takes longer than it may, it is kept for the next call."""
