@@ -52,6 +52,23 @@ def test_energy_does_not_grow_while_an_elastic_block_comes_to_lie(support: Rigid
     assert max(energy) <= (2e-3 if support is FLOOR else 0.03) * unit  # over edges the normals of contact come and go
 
 
+@pytest.mark.parametrize("external", [None, (0.0, 0.0, -GRAVITY)])
+def test_many_explicit_steps_in_one_call_are_those_one_by_one(external: tuple[float, float, float] | None) -> None:
+    engine = block("symplectic_euler", 0.5, 0.01)
+    lattice = engine.lattice
+    force = None if external is None else np.outer(lattice.node_mass, external)
+    ends = []
+    for each in (1, 40, 200):
+        with engine.session(external_force=force, indenters=[FLOOR, spherical_indenter((15.0, 15.0, 40.5), 10.0)]) as session:
+            motions = [IndenterVelocity(), IndenterVelocity((100.0, 0.0, -800.0))]
+            taken = [session.step(motions=motions, steps=each) for _ in range(200 // each)]
+            ends.append((session.state().position, np.concatenate([one.indenters for one in taken])))
+    assert np.abs(ends[0][1]).max() > 0.0
+    for position, exerted in ends[1:]:
+        np.testing.assert_allclose(position, ends[0][0], atol=1e-9 * np.abs(ends[0][0] - lattice.points).max())
+        np.testing.assert_allclose(exerted, ends[0][1], atol=1e-9 * np.abs(ends[0][1]).max())
+
+
 @pytest.mark.parametrize("share", [0.9, 0.2])
 def test_a_free_elastic_block_that_hits_something_keeps_at_most_its_energy(share: float) -> None:
     engine = block("symplectic_euler", share)

@@ -24,6 +24,7 @@ from naibu.mechanics.lattices.cpu._contact_solver import (
     solve_exactly,
     solve_roughly,
 )
+from naibu.mechanics.lattices.cpu._explicit_kernels import forces_of_elements
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, begin_with, follow_contacts
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import add_momenta, add_reactions, advance
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import residual_norm
@@ -138,20 +139,21 @@ def _turn(turn, vector, old):  # type: ignore[no-untyped-def]  # pragma: no cove
 def contact_steps(data, contact, weight, motion, solver, reactions, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps in contact; state, `history`, axes and centres are changed, reactions filled.
 
-    `data` are those of an implicit step, with the operator of the contact; `contact` are indenters, surface, history, scratch and vectors:
-    shapes (geometry, axes), centres (k, 3), friction (k, 2), pull-off (k, 3), curvature and depth from which the foundation is stiffer
-    (k, 2) of the indenters; nodes of the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions (q, 4) and weights (p,)
-    at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of `ContactState`; what
+    `data` are those of an implicit step, with the operator of the contact; `contact` are indenters, surface, history, scratch, vectors and
+    elements: shapes (geometry, axes), centres (k, 3), friction (k, 2), pull-off (k, 3), curvature and depth from which the foundation is
+    stiffer (k, 2) of the indenters; nodes of the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions (q, 4) and weights
+    (p,) at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of `ContactState`; what
     `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal blocks, numbers of the
     nodes (COLUMNS, k, n), how far they are covered (k, n), whether multipliers are found with the end of the step, the mean acceleration in
-    the step before (3, n) and how much of it lasted (1,), which are changed; and room for four vectors (3 pad,). Constrained
-    components of `data` move by their weights times the velocities of their bodies; `motion` are these (steps, bodies, 3), and velocities
-    and angular velocities of the indenters (steps, k, 3); `solver` the limits of the solver; `reactions` those of the bodies and of the
-    indenters; `most` the most passes.
+    the step before (3, n) and how much of it lasted (1,), which are changed; room for four vectors (3 pad,); and, of explicit steps, whose
+    `data` are those of the masses alone under external forces that are set in every step, what `forces_of_elements` takes: blocks, tables,
+    extensions and external forces; else empty. Constrained components of `data` move by their weights times the velocities of their
+    bodies; `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the limits
+    of the solver; `reactions` those of the bodies and of the indenters; `most` the most passes.
     Returns iterations, passes and the steps whose contacts did not settle.
     """
     (_, _, mass, v, work, inner, now), (x, _, _, before, base, external, step) = data
-    indenters, surface, history, scratch, (change, given, plain, origin) = contact
+    indenters, surface, history, scratch, (change, given, plain, origin), (blocks, tables, extension, applied) = contact
     (_, axes), centres, _, _, _ = indenters
     held_velocity, velocity, spin = motion
     lists, points, slid, slot, diagonal, nodal, covered, together, trend, trust = scratch
@@ -162,6 +164,8 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
     room = new_room()
     begin_with(inner, now)
     for n in range(len(velocity)):
+        if len(extension):
+            forces_of_elements(blocks, tables, (x, v, extension), applied, external)
         for i in range(len(v)):
             before[i] = v[i]
             base[i] = step * external[i] if i < len(external) else 0.0

@@ -18,7 +18,7 @@ from naibu.mechanics.lattices.cpu._contact_multipliers import COLUMNS
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 from naibu.mechanics.lattices.cpu._contact_points import COLUMNS as POINT_COLUMNS
 from naibu.mechanics.lattices.cpu._contact_points import RESULTS, rest_at
-from naibu.mechanics.lattices.cpu.explicit_contact import ElementForces
+from naibu.mechanics.lattices.cpu.explicit_contact import ElementForces, no_elements
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, TOUCHED
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import COARSE, POOL
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments
@@ -164,16 +164,8 @@ class ContactStepper:
             values[:] = 0.0
         data, own = self._arguments_of(base, parts)
         motion, limits = (held_velocity, velocity, spin), (base.tolerance, MOST_ITERATIONS)
-        if self.forces is None:
-            found: tuple[int, int, int] = contact_steps(data, own, base.constrained[2], motion, limits, reactions, self.passes)
-            return found
-        total = np.zeros(3, dtype=np.int64)
-        for n in range(len(velocity)):
-            row = slice(n, n + 1)
-            self.forces.begin_step(parts)
-            step, exerted = tuple(values[row] for values in motion), tuple(values[row] for values in reactions)
-            total += contact_steps(data, own, base.constrained[2], step, limits, exerted, self.passes)
-        return int(total[0]), int(total[1]), int(total[2])
+        found: tuple[int, int, int] = contact_steps(data, own, base.constrained[2], motion, limits, reactions, self.passes)
+        return found
 
     def _arguments_of(self, base: ImplicitStepper, parts: int) -> tuple[PackedArguments, PackedArguments]:
         """Return what the kernels read of a stepper that shares the state, and of the contact."""
@@ -190,7 +182,8 @@ class ContactStepper:
             vectors = tuple(np.zeros_like(base.position) for _ in range(4))
             together = not self.surface.resists_at_once(base.step, base.mass)
             scratch = (*own, contact.covered, together, contact.acceleration, contact.lasting)
-            known = base.constrained, data, packed(self._shapes(), surface, history, scratch, vectors)
+            elements = no_elements() if self.forces is None else self.forces.arguments(parts)
+            known = base.constrained, data, packed(self._shapes(), surface, history, scratch, vectors, elements)
             self._arguments[parts] = known
         return known[1], known[2]
 

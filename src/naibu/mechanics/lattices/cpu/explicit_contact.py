@@ -9,13 +9,12 @@ would by a penalty at the beginning of the step.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from naibu._numba.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, FloatArray
-from naibu.mechanics.lattices.cpu._explicit_kernels import forces_of_elements
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel
 from naibu.mechanics.lattices.cpu.implicit.coarse_space import no_coarse_space
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, ScratchPool
@@ -38,22 +37,19 @@ class ElementForces:
     blocks : Blocks
         Their storage.
     force : ndarray, shape (3 pad,)
-        At the beginning of the step, external ones included, mN.
+        At the beginning of the step, external ones included, mN; set by the steps.
     """
 
     stepper: ExplicitStepper
     parameters: LatticeParameters
     blocks: Blocks
     force: FloatArray
-    _tables: dict[int, KernelTuple] = field(default_factory=dict)
 
-    def begin_step(self, parts: int) -> None:
-        """Set the forces, and move the extensions on, for a step shorter by `parts` than that of the stepper."""
+    def arguments(self, parts: int) -> KernelTuple:
+        """Return what `contact_steps` takes of the elements for steps shorter by `parts` than those of the stepper."""
         own = self.stepper
-        if parts not in self._tables:
-            self._tables[parts] = explicit_kernel(self.parameters, own.step / parts, self.blocks, own.kernel[2][0], 1, own.forward)
-        blocks, tables, _, _ = self._tables[parts]
-        forces_of_elements(blocks, tables, (own.position, own.velocity, own.extension), own.external, self.force)
+        blocks, tables, _, _ = explicit_kernel(self.parameters, own.step / parts, self.blocks, own.kernel[2][0], 1, own.forward)
+        return blocks, tables, own.extension, own.external
 
     def masses(self, parts: int) -> ImplicitStepper:
         """Return a stepper of the masses, without elements, under these forces; it shares position and velocity with the lattice."""
@@ -70,6 +66,12 @@ class ElementForces:
 def element_forces_of(stepper: ExplicitStepper, parameters: LatticeParameters, blocks: Blocks) -> ElementForces:
     """Return the forces of the elements of an explicit stepper."""
     return ElementForces(stepper, parameters, blocks, aligned(stepper.position.shape, float))
+
+
+def no_elements() -> KernelTuple:
+    """Return what `contact_steps` takes of the elements where steps are implicit."""
+    none, empty = np.zeros(0, dtype=np.int64), aligned((0,), float)
+    return (none, none, none), (empty, empty, empty, empty), empty, empty
 
 
 def _kernel_of_masses(mass: AnyFloatArray) -> tuple[KernelTuple, ScratchPool]:
