@@ -291,11 +291,12 @@ def _correlated(
     if not parts:
         return measured_by(found, reference, inside)
     rest = inside & ~np.logical_or.reduce([part for part, _ in parts])
-    return _joined([measured_by(own, reference, part) for part, own in [*parts, (rest, found)]], inside)
+    each = [*parts, (rest, found)] if rest.any() else parts
+    return _joined([measured_by(own, reference, part) for part, own in each], len(parts), inside)
 
 
-def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> MeasuredDisplacement:
-    """Return the displacement of parts of an object that were measured by themselves, the last of which is the rest."""
+def _joined(measured: Sequence[MeasuredDisplacement], own: int, inside: BoolArray) -> MeasuredDisplacement:
+    """Return the displacement of parts of an object, the first `own` of which were measured by themselves."""
     first, *others = measured
     vectors, gradient = first.displacement.vectors.copy(), first.gradient.copy()
     covariance, strain_sd = first.displacement.covariance, first.strain_sd
@@ -309,13 +310,12 @@ def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> Meas
     valid = np.logical_or.reduce([one.displacement.valid for one in measured])
     blocks = [one.blocks for one in measured if one.blocks is not None]
     each = [np.concatenate([getattr(b, name) for b in blocks]) for name in ("points", "vectors", "covariance")]
-    parts = sum(bool(one.mask.any()) for one in measured)
-    told = f"{parts - 1} part(s) of the object, of another intensity than the rest, have a field of their own: they slide on it."
+    told = f"{own} part(s) of the object, which differ in intensity, have a field of their own: parts slide on each other."
     return replace(
         first,
         displacement=DisplacementField.on_grid(first.displacement.grid, vectors, covariance=covariance, valid=valid),
         mask=inside, gradient=gradient, strain_sd=strain_sd,
-        facts=_worst_of([one.facts for one in measured]) | {"parts": parts},
+        facts=_worst_of([one.facts for one in measured]) | {"parts": len(measured)},
         warnings=tuple(dict.fromkeys([told, *(doubt for one in measured for doubt in one.warnings)])),
         blocks=DisplacementField.from_arrays(each[0], each[1], covariance=each[2]),
     )  # fmt: skip

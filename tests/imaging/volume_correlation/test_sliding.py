@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.volume import Volume
 from naibu.imaging.measure_displacement import measure_displacement
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
+from naibu.imaging.volume_correlation.part_by_part import correlated_parts, with_own_field
 from naibu.validation.scanners.textures import Texture
 
 SHAPE, SPACING_MM, SLIDE_MM = (44, 52, 60), (1.0, 1.0, 1.0), 6.0
@@ -64,9 +66,10 @@ def test_parts_that_differ_in_intensity_are_measured_by_themselves() -> None:
     before, after, truth, ball = scans(SLIDE_MM, upper=300.0)
     one = correlate_volumes(before, after, mask=ball)
     found = measure_displacement(before, after, mask=ball)
-    assert found.facts["parts"] == 2
-    assert found.facts["residual_sd"] >= one.residual_sd  # diagnostics are those of the worst part
-    assert found.facts["unconverged_cells"] >= (~one.converged).sum()
+    parts = [part for _, part in correlated_parts(before, after, ball, one)]
+    assert found.facts["parts"] == len(parts) == 2  # both halves have their own field
+    assert found.facts["residual_sd"] == max(part.residual_sd for part in parts)  # diagnostics are those of the worst part
+    assert found.facts["unconverged_cells"] == sum((~part.converged).sum() for part in parts)
     near = ball & (np.abs(positions(before)[..., 2] - MIDDLE_MM[2]) < 3.0)
 
     def missed(vectors: FloatArray) -> float:
@@ -90,3 +93,23 @@ def test_parts_that_differ_in_intensity_are_measured_by_themselves() -> None:
 def test_an_object_that_moves_as_one_is_measured_as_one() -> None:
     before, after, _, ball = scans(0.0, upper=500.0)
     assert "parts" not in measure_displacement(before, after, mask=ball).facts
+
+
+@pytest.mark.parametrize(
+    ("left_mm", "chosen"),
+    [
+        ([(0.79, 1.0), (1.5, 1.0)], [True, True]),  # one field is wrong on both sides of where parts slide
+        ([(1.0, 1.0), (0.39, 0.5)], [True, True]),
+        ([(0.8, 1.0), (0.9, 1.0)], [False, False]),  # no part gains a fifth: they move as one
+        ([(0.81, 1.0), (0.4, 0.5)], [False, False]),
+        ([(0.0, 0.0), (0.9, 1.0)], [False, False]),
+        ([(0.5, 1.0), (2.0, 1.0)], [True, True]),
+        ([(0.5, 1.0), (2.01, 1.0)], [True, False]),  # a field that has lost its way is no answer
+        ([(0.5, 1.0), (np.nan, 1.0)], [True, False]),
+        ([(0.5, 1.0)], [True]),  # the other part cannot be measured by itself
+        ([], []),
+    ],
+)
+def test_every_part_has_its_own_field_once_one_gains_by_it(left_mm: list[tuple[float, float]], chosen: list[bool]) -> None:
+    """Of the mean distances that the own field of each part, and that of the whole, leave between structures."""
+    assert with_own_field(left_mm) == chosen

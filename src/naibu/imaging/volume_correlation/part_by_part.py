@@ -7,6 +7,8 @@ structures apart.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from naibu.core.arrays import BoolArray
@@ -22,7 +24,9 @@ from naibu.imaging.volume_correlation.results.correlation_result import Correlat
 # empirical: fraction of the cells that one field leaves more than a voxel apart, above which parts are measured by themselves. Legs and
 # chests that move as one have none, lungs that slide by 17 mm along a wall without texture 0.05, those that slide by 20 mm 0.3
 APART = 0.04
-LESS = 0.8  # of what one field leaves apart in a part: it is measured by itself if its own field leaves less
+# of what one field leaves apart in a part. Where the own field of a part leaves less than that, parts slide on each other, and one field is
+# wrong on both sides of where they do: every part then has its own, unless that leaves so much more that it has lost its way
+LESS, LOST = 0.8, 2.0
 SAMPLED = 7  # every so many voxels of a part are looked at
 
 
@@ -45,7 +49,8 @@ def correlated_parts(
     Returns
     -------
     tuple of (ndarray of shape (nz, ny, nx), CorrelationResult)
-        Voxels of parts whose own field leaves less apart; none where the object moves as one, or has one intensity only.
+        Voxels of parts, all of them if the own field of one leaves less apart, but for those that cannot be measured by themselves; none
+        where the object moves as one, or has one intensity only.
     """
     if whole.misplaced_fraction < APART:
         return ()
@@ -53,15 +58,22 @@ def correlated_parts(
     if not parts:
         return ()
     shown = intensity_parts(deformed, mask_in_view(deformed, fields_of_view(reference, deformed)[1]))
-    found = []
+    found, left = [], []
     for part, there in zip(parts, shown or (None,) * len(parts), strict=True):
         try:
             own = correlate_volumes(reference, deformed, mask=part, deformed_mask=there, progress=progress)
         except InputError:
             continue  # too small, or without content in common: the field of the whole object stands, and tells that it is uncertain
-        if _left_apart(own, part) < LESS * _left_apart(whole, part):
-            found.append((part, own))
-    return tuple(found)
+        found.append((part, own))
+        left.append((_left_apart(own, part), _left_apart(whole, part)))
+    return tuple(each for each, chosen in zip(found, with_own_field(left), strict=True) if chosen)
+
+
+def with_own_field(left_mm: Sequence[tuple[float, float]]) -> list[bool]:
+    """Return which parts are measured by themselves, of what their own field and that of the whole object leave apart in each, mm."""
+    if not any(own < LESS * one for own, one in left_mm):
+        return [False] * len(left_mm)
+    return [own <= LOST * one for own, one in left_mm]
 
 
 def _left_apart(found: CorrelationResult, part: BoolArray) -> float:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from naibu.core.volume import Volume
 from naibu.imaging.measure_displacement import measured_by
+from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.correlate import Correlation, correlate_volumes
 from naibu.imaging.volume_correlation.results.block_displacements import LEFT
 from naibu.imaging.volume_correlation.results.cell_errors import BENDING_BIAS, DILATATION_BIAS, bias_variance, biases
 from naibu.imaging.volume_correlation.settings import CorrelationSettings
+from naibu.validation.scanners.textures import Texture
 from naibu.validation.specimens.textured_sphere import squeezed_ball
 
 Array = np.ndarray
@@ -72,3 +75,32 @@ def test_the_covariance_holds_the_bias_and_that_of_blocks_a_part_of_it() -> None
     more = stated.covariance - blocks.covariance[kept]
     left = LEFT**2 * found.bias_at(stated.points) + found.misplacement_at(stated.points)
     np.testing.assert_allclose(more, left[:, None, None] * np.eye(3), atol=1e-9)
+
+
+def test_regions_hold_a_part_that_swells_where_volume_is_not_penalised() -> None:
+    """By 15 % in the middle of a part, in a ball that else keeps its volume: the penalty would take most of that away."""
+    frame, middle = Volume.from_array(np.zeros((40, 44, 48)), spacing_mm=(1.0, 1.0, 1.0)), np.array([23.5, 21.5, 19.5])
+    x, grey, rng = positions(frame), Texture.drawn(3.0, seed=1), np.random.default_rng([1, 1])
+
+    def swollen(at: Array) -> Array:
+        arm = at - middle - [5.0, 0.0, 0.0]
+        return np.asarray(0.05 * arm * np.exp(-0.5 * (arm**2).sum(axis=-1, keepdims=True) / 5.0**2))
+
+    def seen(at: Array) -> Array:
+        inside = (((at - middle) / [18.0, 16.0, 15.0]) ** 2).sum(axis=-1) < 1.0
+        values = np.where(inside, 150.0 + 30.0 * grey(at.reshape(-1, 3)).reshape(inside.shape), 10.0)
+        return np.asarray(values + rng.normal(0.0, 9.0, inside.shape))
+
+    origin = x.copy()
+    for _ in range(60):
+        origin = x - swollen(origin)
+    near = np.linalg.norm(x - middle - [5.0, 0.0, 0.0], axis=-1) < 9.0
+    ball = (((x - middle) / [18.0, 16.0, 15.0]) ** 2).sum(axis=-1) < 1.0
+    before, after = (frame.with_values(seen(at)) for at in (x, origin))
+    found = correlate_volumes(before, after, mask=ball, settings=CorrelationSettings(dilatation_penalty=False))
+    where = np.argwhere(near & ball & found.valid)
+    error = (found.displacement.vectors - swollen(x))[tuple(where.T)]
+    covariance = found.covariance_at(where[:, ::-1].astype(float))
+    held = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]) < 7.815  # chi-squared, 95 %
+    assert held.mean() > 0.95
+    assert np.linalg.norm(error, axis=1).mean() < 0.09
