@@ -134,14 +134,16 @@ def search_bins(
             if x[0] < box[0] or x[1] < box[1] or x[2] < box[2] or x[0] > box[3] or x[1] > box[4] or x[2] > box[5]:
                 continue
             for i in range(k):
-                p[i] = points[cells[c, i]]
+                for d in range(3):  # one by one: the first assignment of arrays takes Numba a second to compile
+                    p[i, d] = points[cells[c, i], d]
             if not invert(p, x, u, n, dn):
                 continue
             out = excess(k, u)
             if out < best:
                 best = out
                 found[q] = c
-                local[q] = u
+                for d in range(3):
+                    local[q, d] = u[d]
             if best <= 0.0:
                 break
 
@@ -166,12 +168,13 @@ def search_nearest(
         for m in range(offsets[q], offsets[q + 1]):
             c = candidates[m]
             for i in range(k):
-                p[i] = points[cells[c, i]]
+                for d in range(3):  # one by one: the first assignment of arrays takes Numba a second to compile
+                    p[i, d] = points[cells[c, i], d]
             if invert(p, x, u, n, dn):
                 clamp(k, u, v)
             else:
-                u[:] = 0.0 if k == 8 else 0.25
-                v[:] = u
+                for d in range(3):
+                    u[d] = v[d] = 0.0 if k == 8 else 0.25
             shape(k, v, n, dn)
             gap = 0.0
             for d in range(3):
@@ -182,7 +185,8 @@ def search_nearest(
             if gap**0.5 < distance[q]:
                 distance[q] = gap**0.5
                 found[q] = c
-                local[q] = u
+                for d in range(3):
+                    local[q, d] = u[d]
 
 
 @njit(cache=True)
