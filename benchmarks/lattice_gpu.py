@@ -5,8 +5,10 @@ device; compilation, and the way of the state to the device and back, are not co
 `explicit_step_limit` allows. Bytes are those that an explicit step cannot avoid to move: the lists of neighbours with their rows of
 coefficients and extensions, and the nodes once each.
 
-Run: ``python benchmarks/lattice_gpu.py [--device cuda:0] [--sizes 8,16,32,64,128] [--steps 100] [--no-cpu] [--no-implicit]``;
-128 is the lattice of 129^3 nodes and 27 million elements, which takes minutes to build.
+Implicit steps on the device are also taken without the coarse levels of their preconditioner.
+
+Run: ``python benchmarks/lattice_gpu.py [--device cuda:0] [--sizes 8,16,32,64,128] [--steps 100] [--no-cpu] [--no-implicit] [--record]``;
+128 is the lattice of 129^3 nodes and 27 million elements, which takes a minute to build; the processor is left out from there on.
 """
 
 from __future__ import annotations
@@ -16,11 +18,13 @@ import os
 import resource
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numba
 import numpy as np
 import warp
+from records import Cell, ResultTable, write_record
 
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.gpu.engine import WarpLatticeEngine
@@ -30,6 +34,9 @@ from naibu.mechanics.lattices.model.state import ConstrainedNodes, Motion, expli
 SIDE_MM, MASS_KG = 80.0, 0.63
 GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 at 9^3 nodes
 STIFF = (10.0, 5.0, 10.0)
+COLUMNS = ("nodes", "elements", "step", "where", "a step, ms", "iterations a step", "moved, GB/s")
+LARGEST_ON_PROCESSOR = 64  # voxels an edge
+ROWS: list[tuple[Cell, ...]] = []
 
 
 def clocked(action: Callable[[], Any]) -> tuple[float, Any]:
@@ -64,8 +71,9 @@ def differences(one: Motion, other: Motion) -> str:
     return f"position {position:.1e}, reaction {reaction:.1e}"
 
 
-def row(name: str, seconds: float, told: str = "") -> None:
-    print(f"  {name:44s} {1e3 * seconds:10.4f} ms a step   {told}", flush=True)
+def row(lattice: Lattice, kind: str, where: str, seconds: float, told: str, iterations: Cell = "", speed: Cell = "") -> None:
+    print(f"  {where + ', ' + kind:58s} {1e3 * seconds:10.4f} ms a step   {told}", flush=True)
+    ROWS.append((lattice.n_nodes, lattice.n_elements, kind, where, 1e3 * seconds, iterations, speed))
 
 
 def explicit(lattice: Lattice, n: int, device: str, steps: int, repeats: int, cpu: bool) -> None:
@@ -81,7 +89,9 @@ def explicit(lattice: Lattice, n: int, device: str, steps: int, repeats: int, cp
         entries, size = 2 * lattice.n_elements, 8 if precision == "double" else 4
         moved = entries * (4 + warp.types.type_size_in_bytes(engine.row.dtype) + 2 * size)
         moved += lattice.n_nodes * size * (6 + 3 + 3 + 1 + 12)
-        row(f"{device}, explicit, {precision}", taken, f"{moved / 1e9:.3f} GB, {moved / taken / 1e9:.1f} GB/s; prepared in {built:.1f} s")
+        speed = moved / taken / 1e9
+        told = f"{moved / 1e9:.3f} GB, {speed:.1f} GB/s; prepared in {built:.1f} s"
+        row(lattice, f"explicit, {precision}", device_name(device), taken, told, speed=speed)
         if not cpu:
             continue
         built, reference = clocked(lambda options=options: LatticeEngine.of(lattice, parameters, **options))
@@ -91,28 +101,32 @@ def explicit(lattice: Lattice, n: int, device: str, steps: int, repeats: int, cp
         whole = least(lambda reference=reference, start=start: reference.run(start, steps, constrained, velocity), repeats)
         expected = reference.run(start, steps, constrained, velocity)
         told = f"{differences(engine.run(engine.rest(), steps, constrained, velocity), expected)} apart; prepared in {built:.1f} s"
-        row(f"processor, explicit, {precision}, {reference.threads} thread(s)", (whole - call) / steps, told)
+        row(lattice, f"explicit, {precision}", f"processor, {reference.threads} thread(s)", (whole - call) / steps, told)
 
 
 def implicit(lattice: Lattice, device: str, steps: int, repeats: int, cpu: bool) -> None:
     parameters = lattice_parameters(lattice, *STIFF)
     constrained, velocity = pushed(lattice)
-    engine = WarpLatticeEngine.of(lattice, parameters, device=device)
-    session = engine.session(None, constrained)
-    session.step(velocity, steps=2)
-    before = session.iterations
-    taken = least(lambda: session.step(velocity, steps=steps), repeats) / steps
-    row(f"{device}, implicit", taken, f"{(session.iterations - before) / (steps * repeats):.1f} iterations")
+    built, engine = clocked(lambda: WarpLatticeEngine.of(lattice, parameters, device=device))
+    for levels in (engine, replace(engine, coarse=None)) if engine.coarse else (engine,):
+        session = levels.session(None, constrained)
+        session.step(velocity, steps=2)
+        before = session.iterations
+        taken = least(lambda session=session: session.step(velocity, steps=steps), repeats) / steps
+        count = (session.iterations - before) / (steps * repeats)
+        kind = f"implicit, {len(levels.coarse.levels) if levels.coarse else 'no'} coarse levels"
+        row(lattice, kind, device_name(device), taken, f"{count:.1f} iterations; prepared in {built:.1f} s", count)
     if cpu:
         reference = LatticeEngine.of(lattice, parameters)
         start = reference.run(reference.rest(), 2, constrained, velocity).state
         call = least(lambda: reference.run(start, 0, constrained, velocity), repeats)
         whole = least(lambda: reference.run(start, steps, constrained, velocity), repeats)
-        row(
-            "processor, implicit, 1 thread",
-            (whole - call) / steps,
-            f"{reference.run(start, steps, constrained, velocity).iterations:.1f} iterations",
-        )
+        count = reference.run(start, steps, constrained, velocity).iterations
+        row(lattice, "implicit", f"processor, {reference.threads} thread(s)", (whole - call) / steps, f"{count:.1f} iterations", count)
+
+
+def device_name(device: str) -> str:
+    return f"Warp {warp.__version__}, {warp.get_device(device).name}"
 
 
 def main() -> None:
@@ -123,6 +137,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--no-cpu", action="store_true", help="leave out the engine of the processor")
     parser.add_argument("--no-implicit", action="store_true")
+    parser.add_argument("--record", action="store_true")
     asked = parser.parse_args()
     warp.config.log_level = warp.LOG_WARNING
     cards = [f"{d.alias} {d.name}" for d in warp.get_cuda_devices()]
@@ -133,10 +148,13 @@ def main() -> None:
     for n in (int(size) for size in asked.sizes.split(",")):
         built, lattice = clocked(lambda n=n: classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG))
         print(f"{n + 1}^3 nodes, {lattice.n_elements} elements, built in {built:.1f} s, peak {peak_gb():.2f} GB", flush=True)
-        explicit(lattice, n, device, asked.steps, asked.repeats, not asked.no_cpu)
+        cpu = not asked.no_cpu and n <= LARGEST_ON_PROCESSOR
+        explicit(lattice, n, device, asked.steps, asked.repeats, cpu)
         if not asked.no_implicit:
-            implicit(lattice, device, max(asked.steps // 10, 2), asked.repeats, not asked.no_cpu)
+            implicit(lattice, device, max(asked.steps // 10, 2), asked.repeats, cpu)
         print(f"  peak {peak_gb():.2f} GB", flush=True)
+        if asked.record:
+            write_record("lattice_gpu", [ResultTable("steps", COLUMNS, tuple(ROWS))])
 
 
 if __name__ == "__main__":

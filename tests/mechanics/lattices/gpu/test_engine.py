@@ -187,12 +187,12 @@ def test_rotation_is_held_back_as_on_the_processor(device):
 @pytest.mark.parametrize("arch", [80, 90])
 def test_the_kernels_compile_for_cuda_without_a_gpu(arch, tmp_path):
     warp = pytest.importorskip("warp")
-    from naibu.mechanics.lattices.gpu import _explicit_kernels, _implicit_kernels
+    from naibu.mechanics.lattices.gpu import _coarse_kernels, _explicit_kernels, _implicit_kernels
 
     warp.init()
     if warp.get_cuda_toolkit_version() is None:
         pytest.skip("this Warp was built without CUDA")
-    for module in (_explicit_kernels, _implicit_kernels):
+    for module in (_coarse_kernels, _explicit_kernels, _implicit_kernels):
         warp.compile_aot_module(module, arch=arch, module_dir=tmp_path / module.__name__)
         assert any(path.suffix in (".ptx", ".cubin") and path.stat().st_size for path in (tmp_path / module.__name__).iterdir())
 

@@ -106,9 +106,13 @@ def residual(
 
 
 @wp.func
-def going(norm: wp.array[wp.float64], goal: wp.array[wp.float64], curvature: wp.array[wp.float64]) -> bool:
-    """Tell whether the solver goes on: iterations that are given to the device beyond its end change nothing."""
-    return bool(norm[0] > goal[0] and curvature[0] > wp.float64(0.0))
+def going(norm: wp.array[wp.vec2d], goal: wp.array[wp.float64], curvature: wp.array[wp.float64]) -> bool:
+    """Tell whether the solver goes on: iterations that are given to the device beyond its end change nothing.
+
+    `norm` holds the squares of the residual's norms in the smoother, by which it ends, and in the preconditioner.
+    """
+    zero = wp.float64(0.0)
+    return bool(norm[0][0] > goal[0] and norm[0][1] > zero and curvature[0] > zero)
 
 
 @wp.kernel
@@ -124,7 +128,7 @@ def multiply(
     step: wp.float64,
     q: wp.array[wp.vec3d],
     always: wp.bool,
-    norm: wp.array[wp.float64],
+    norm: wp.array[wp.vec2d],
     goal: wp.array[wp.float64],
     curvature: wp.array[wp.float64],
 ) -> None:
@@ -146,15 +150,15 @@ def multiply(
 
 
 @wp.kernel
-def scaled(smoother: wp.array[wp.float64], r: wp.array[wp.vec3d], z: wp.array[wp.vec3d]) -> None:
-    """Set z to the residual times the smoother."""
+def scaled(smoother: wp.array[wp.float64], r: wp.array[wp.vec3d], smoothed: wp.array[wp.vec3d]) -> None:
+    """Set `smoothed` to the residual times the smoother."""
     i = wp.tid()
-    z[i] = smoother[i] * r[i]
+    smoothed[i] = smoother[i] * r[i]
 
 
 @wp.kernel
 def descend(
-    norm: wp.array[wp.float64],
+    norm: wp.array[wp.vec2d],
     goal: wp.array[wp.float64],
     curvature: wp.array[wp.float64],
     smoother: wp.array[wp.float64],
@@ -162,39 +166,39 @@ def descend(
     q: wp.array[wp.vec3d],
     v: wp.array[wp.vec3d],
     r: wp.array[wp.vec3d],
-    z: wp.array[wp.vec3d],
+    smoothed: wp.array[wp.vec3d],
 ) -> None:
-    """Move v along p to the least energy, r with it; set z to the residual times the smoother."""
+    """Move v along p to the least energy, r with it; set `smoothed` to the residual times the smoother."""
     i = wp.tid()
     if going(norm, goal, curvature):
-        fraction = norm[0] / curvature[0]
+        fraction = norm[0][1] / curvature[0]
         v[i] = v[i] + fraction * p[i]
         left = r[i] - fraction * q[i]
         r[i] = left
-        z[i] = smoother[i] * left
+        smoothed[i] = smoother[i] * left
 
 
 @wp.kernel
 def turn(
-    norm: wp.array[wp.float64],
+    norm: wp.array[wp.vec2d],
     goal: wp.array[wp.float64],
     curvature: wp.array[wp.float64],
-    later: wp.array[wp.float64],
+    later: wp.array[wp.vec2d],
     z: wp.array[wp.vec3d],
     p: wp.array[wp.vec3d],
 ) -> None:
     """Set p to the next direction."""
     i = wp.tid()
     if going(norm, goal, curvature):
-        p[i] = z[i] + (later[0] / norm[0]) * p[i]
+        p[i] = z[i] + (later[0][1] / norm[0][1]) * p[i]
 
 
 @wp.kernel
 def accept(
-    norm: wp.array[wp.float64],
+    norm: wp.array[wp.vec2d],
     goal: wp.array[wp.float64],
     curvature: wp.array[wp.float64],
-    later: wp.array[wp.float64],
+    later: wp.array[wp.vec2d],
     turns: wp.array[wp.int32],
 ) -> None:
     """Take on the later norm and count the iteration."""
@@ -213,6 +217,35 @@ def products(a: wp.array[wp.vec3d], b: wp.array[wp.vec3d], sums: wp.array[wp.flo
         k += sums.shape[0]
         if k < a.shape[0]:
             s += wp.dot(a[k], b[k])
+    sums[c] = s
+
+
+@wp.kernel
+def norms(r: wp.array[wp.vec3d], smoothed: wp.array[wp.vec3d], z: wp.array[wp.vec3d], sums: wp.array[wp.vec2d]) -> None:
+    """Set sums[c] to the sums of r . smoothed and r . z over the nodes c, c + p, ..., p being the number of sums."""
+    c = wp.tid()
+    k = c
+    s = wp.vec2d()
+    for _ in range(FOLD):
+        if k < r.shape[0]:
+            s += wp.vec2d(wp.dot(r[k], smoothed[k]), wp.dot(r[k], z[k]))
+        k += sums.shape[0]
+    sums[c] = s
+
+
+@wp.kernel
+def fold_norms(values: wp.array[wp.vec2d], sums: wp.array[wp.vec2d]) -> None:
+    """Do as `fold` does.
+
+    It is a kernel of its own, since Warp 1.19 takes two overloads of one kernel for the same when it records launches on the processor.
+    """
+    c = wp.tid()
+    k = c
+    s = wp.vec2d()
+    for _ in range(FOLD):
+        if k < values.shape[0]:
+            s += values[k]
+        k += sums.shape[0]
     sums[c] = s
 
 

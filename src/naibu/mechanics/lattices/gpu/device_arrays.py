@@ -63,7 +63,7 @@ def chosen_device(device: str | None) -> object:
 def recorded(launches: Callable[[], None], device: object) -> Callable[[], None]:
     """Record launches of kernels, which do nothing yet, and return a function that gives them all to the device at once."""
     wp = warp_package()
-    for name in ("_explicit_kernels", "_implicit_kernels"):
+    for name in ("_explicit_kernels", "_implicit_kernels", "_coarse_kernels"):
         wp.load_module(compiled(name), device=device)  # not while recording: older drivers cannot
     with wp.ScopedCapture(device=device) as capture:
         launches()

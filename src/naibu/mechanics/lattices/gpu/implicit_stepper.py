@@ -14,6 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from naibu.core.arrays import FloatArray
+from naibu.mechanics.lattices.gpu.coarse_levels import CoarseCorrection
 from naibu.mechanics.lattices.gpu.device_arrays import ConstrainedArrays, compiled, recorded, warp_package
 from naibu.mechanics.lattices.gpu.prepared_lattice import PreparedLattice
 from naibu.mechanics.lattices.gpu.warp_types import WarpArray
@@ -43,16 +44,18 @@ class DeviceSums:
             sizes.append(-(-sizes[-1] // fold))
         self.levels = [wp.zeros(size, dtype=dtype, device=device) for size in sizes]
         self.device = device
+        self.kernel = compiled("_implicit_kernels").fold_norms if dtype is wp.vec2d else compiled("_explicit_kernels").fold
 
     def of(self, values: WarpArray) -> FloatArray:
         """Return the sum of values of the nodes."""
         self._fold(values, self.levels[0])
         return self._folded(self.levels[-1])
 
-    def dot(self, a: WarpArray, b: WarpArray, into: WarpArray) -> None:
-        """Set `into` (1,) to a . b."""
-        levels = [*self.levels[:-1], into]
-        warp_package().launch(compiled("_implicit_kernels").products, levels[0].shape[0], inputs=[a, b, levels[0]], device=self.device)
+    def dot(self, into: WarpArray, *arrays: WarpArray) -> None:
+        """Set `into` (1,) to a . b of two arrays, or to a . b and a . c of three."""
+        levels, kernels = [*self.levels[:-1], into], compiled("_implicit_kernels")
+        kernel = kernels.products if len(arrays) == 2 else kernels.norms
+        warp_package().launch(kernel, levels[0].shape[0], inputs=[*arrays, levels[0]], device=self.device)
         self._folded(into, read=False)
 
     def _folded(self, into: WarpArray, *, read: bool = True) -> FloatArray:
@@ -62,7 +65,7 @@ class DeviceSums:
         return np.array(into.numpy()[0], dtype=float) if read else np.zeros(0)
 
     def _fold(self, values: WarpArray, sums: WarpArray) -> None:
-        warp_package().launch(compiled("_explicit_kernels").fold, sums.shape[0], inputs=[values, sums], device=self.device)
+        warp_package().launch(self.kernel, sums.shape[0], inputs=[values, sums], device=self.device)
 
 
 class SteppedSession(Protocol):
@@ -95,7 +98,13 @@ class ImplicitSteps:
         Inverse diagonal of the matrix, its mean over the axes, 1/kg.
     before, r, z, p, q : warp array (n,), vec3d
         Velocity before the step, residual, and directions of the solver.
-    norm, goal, curvature, new : warp array (1,)
+    smoothed : warp array (n,), vec3d
+        Residual times the smoother; z itself where there is no coarse correction.
+    coarse : CoarseCorrection, optional
+        Coarse levels of the preconditioner.
+    norm, new : warp array (1,), vec2d
+        Squares of the residual's norms in the smoother and in the preconditioner, and those of the next iteration.
+    goal, curvature : warp array (1,)
         Scalars of the solver.
     turns : warp array (1,), int32
         Its iterations.
@@ -103,7 +112,7 @@ class ImplicitSteps:
         For other sums.
     node_scalar, node_vector, node_moments : warp array (n,)
         What is added up over the nodes.
-    scalars, vectors, moments : DeviceSums
+    scalars, pairs, vectors, moments : DeviceSums
         Which add it up.
     """
 
@@ -113,8 +122,10 @@ class ImplicitSteps:
     before: WarpArray
     r: WarpArray
     z: WarpArray
+    smoothed: WarpArray
     p: WarpArray
     q: WarpArray
+    coarse: CoarseCorrection | None
     norm: WarpArray
     goal: WarpArray
     curvature: WarpArray
@@ -125,6 +136,7 @@ class ImplicitSteps:
     node_vector: WarpArray
     node_moments: WarpArray
     scalars: DeviceSums
+    pairs: DeviceSums
     vectors: DeviceSums
     moments: DeviceSums
     _batch: Callable[[], None] | None = field(default=None, repr=False)
@@ -137,42 +149,45 @@ class ImplicitSteps:
         lattice, device = engine.lattice, engine.device
         n = lattice.n_nodes
         known = followed_lengths(lattice, state)
-        i, j = lattice.elements.T
-        stiff = engine.step**2 / 3.0 * engine.table.numpy()[:, 0][engine.lists.of_elements(engine.row).astype(np.int64)]
-        diagonal = lattice.node_mass + np.bincount(i, stiff, minlength=n) + np.bincount(j, stiff, minlength=n)
 
         def zeros(dtype: object, size: int = n) -> WarpArray:
             made: WarpArray = wp.zeros(size, dtype=dtype, device=device)
             return made
 
         before, r, z, p, q, node_vector = (zeros(wp.vec3d) for _ in range(6))
-        norm, goal, curvature, new, scalar = (zeros(wp.float64, 1) for _ in range(5))
+        levels = engine.coarse
+        goal, curvature, scalar = (zeros(wp.float64, 1) for _ in range(3))
         return cls(
             session=session,
             lengths=wp.array(engine.lists.at_both_ends(known, np.float64), dtype=wp.float64, device=device),
-            smoother=wp.array(1.0 / diagonal, dtype=wp.float64, device=device),
+            smoother=wp.array(1.0 / engine.diagonal, dtype=wp.float64, device=device),
             before=before,
             r=r,
             z=z,
+            smoothed=zeros(wp.vec3d) if levels else z,
             p=p,
             q=q,
-            norm=norm,
+            coarse=CoarseCorrection.of(levels, session.constrained, device) if levels else None,
+            norm=zeros(wp.vec2d, 1),
             goal=goal,
             curvature=curvature,
-            new=new,
+            new=zeros(wp.vec2d, 1),
             scalar=scalar,
             turns=zeros(wp.int32, 1),
             node_scalar=zeros(wp.float64),
             node_vector=node_vector,
             node_moments=zeros(kernels.Vector12),
             scalars=DeviceSums(n, wp.float64, device),
+            pairs=DeviceSums(n, wp.vec2d, device),
             vectors=DeviceSums(n, wp.vec3d, device),
             moments=DeviceSums(n, kernels.Vector12, device),
         )
 
-    def forget_recorded(self) -> None:
-        """Record the iterations anew at the next step, for other constraints."""
-        self._batch = None
+    def follow_constraints(self) -> None:
+        """Prepare the solver for the constraints that the session has now."""
+        self._batch = None  # recorded with the old ones
+        if self.coarse is not None:
+            self.coarse = CoarseCorrection.of(self.coarse.levels, self.session.constrained, self.session.engine.device)
 
     def take(self) -> tuple[int, bool]:
         """Take a step; return the iterations of the solver, and whether rotation had to be limited."""
@@ -227,7 +242,7 @@ class ImplicitSteps:
             self._launch("release", constrained.masses, constrained.first, constrained.node, constrained.direction, values)
 
     def _dot(self, a: WarpArray, b: WarpArray) -> float:
-        self.scalars.dot(a, b, self.scalar)
+        self.scalars.dot(self.scalar, a, b)
         return float(self.scalar.numpy()[0])
 
     def _multiply(self, *, always: bool) -> None:
@@ -241,11 +256,10 @@ class ImplicitSteps:
         moving = [engine.mass, session.x, session.y, session.v, self.before, session.external, self._number(engine.step)]
         self._on_lists("residual", *moving, self.r, self.node_scalar)
         floor = float(self.scalars.of(self.node_scalar)) * 1e-20 / float(engine.lattice.node_mass.max())
-        self._on_masses("scaled", self.smoother, self.r, self.z)
-        self._release(self.z)
+        self._on_masses("scaled", self.smoother, self.r, self.smoothed)
+        self._precondition(self.norm)
         warp_package().copy(self.p, self.z)
-        self.scalars.dot(self.r, self.z, self.norm)
-        norm = float(self.norm.numpy()[0])
+        norm = self._norm()
         goal = max(engine.tolerance**2 * norm, floor)
         self.goal.fill_(goal)
         self.curvature.fill_(1.0)
@@ -256,10 +270,23 @@ class ImplicitSteps:
         while norm > goal and asked < _LIMIT:
             self._batch()
             asked += _BATCH
-            norm = float(self.norm.numpy()[0])
+            norm = self._norm()
             if not float(self.curvature.numpy()[0]) > 0.0:
                 break
         return int(self.turns.numpy()[0])
+
+    def _norm(self) -> float:
+        """Return the square of the residual's norm by which the solver ends, zero where the other one is no longer positive."""
+        ending, preconditioned = self.norm.numpy()[0]
+        return float(ending) if preconditioned > 0.0 else 0.0
+
+    def _precondition(self, norm: WarpArray) -> None:
+        """Set z to the preconditioned residual, from what the smoother gave, and the norms of the residual."""
+        self._release(self.smoothed)
+        if self.coarse is not None:
+            self.coarse.apply(self.smoothed, self.z)
+            self._release(self.z)
+        self.pairs.dot(norm, self.r, self.smoothed, self.z)
 
     def _iterations(self) -> None:
         for _ in range(_BATCH):
@@ -268,10 +295,9 @@ class ImplicitSteps:
     def _iteration(self) -> None:
         scalars = [self.norm, self.goal, self.curvature]
         self._multiply(always=False)
-        self.scalars.dot(self.p, self.q, self.curvature)
-        self._on_masses("descend", *scalars, self.smoother, self.p, self.q, self.session.v, self.r, self.z)
-        self._release(self.z)
-        self.scalars.dot(self.r, self.z, self.new)
+        self.scalars.dot(self.curvature, self.p, self.q)
+        self._on_masses("descend", *scalars, self.smoother, self.p, self.q, self.session.v, self.r, self.smoothed)
+        self._precondition(self.new)
         self._on_masses("turn", *scalars, self.new, self.z, self.p)
         self._launch("accept", 1, *scalars, self.new, self.turns)
 

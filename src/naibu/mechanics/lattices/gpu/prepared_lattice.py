@@ -9,6 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
+from naibu.mechanics.lattices.gpu.coarse_levels import CoarseLevels
 from naibu.mechanics.lattices.gpu.device_arrays import (
     NeighbourLists,
     alike_elements,
@@ -48,6 +49,10 @@ class PreparedLattice:
         Numbers of the rows of coefficients of the elements, these rows, and K of each.
     mass, inverse_mass : warp array
         kg and 1/kg.
+    diagonal : ndarray, shape (n,)
+        Of the matrix of an implicit step, mean of the axes, kg; empty with the explicit methods.
+    coarse : CoarseLevels, optional
+        Coarse levels of the implicit solver's preconditioner, where they pay.
     """
 
     lattice: Lattice
@@ -62,6 +67,8 @@ class PreparedLattice:
     stiffness: WarpArray
     mass: WarpArray
     inverse_mass: WarpArray
+    diagonal: FloatArray
+    coarse: CoarseLevels | None
 
     @classmethod
     def of(
@@ -103,6 +110,12 @@ class PreparedLattice:
         codes, rows = alike_elements(parameters)
         coefficients = implicit_coefficients(rows, step) if method == "implicit" else _explicit_rows(rows, step, method == "euler")
         mass = lattice.node_mass
+        diagonal, coarse = np.zeros(0), None
+        if method == "implicit":
+            stiff = step**2 * coefficients[0][codes]
+            i, j = lattice.elements.T
+            diagonal = mass + sum(np.bincount(end, stiff / 3.0, minlength=lattice.n_nodes) for end in (i, j))
+            coarse = CoarseLevels.of(lattice, stiff, diagonal, place)
         return cls(
             lattice,
             parameters,
@@ -116,6 +129,8 @@ class PreparedLattice:
             wp.array(rows.stiffness, dtype=real, device=place),
             wp.array(mass, dtype=real, device=place),
             wp.array(np.divide(1.0, mass, out=np.zeros_like(mass), where=mass > 0.0), dtype=real, device=place),
+            diagonal,
+            coarse,
         )
 
 

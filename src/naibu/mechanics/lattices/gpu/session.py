@@ -137,7 +137,7 @@ class WarpLatticeSession:
         self.parts = wp.zeros((_CHUNK, max(len(self.constrained.part_body), 1)), dtype=wp.vec3d, device=device)
         self._many = None  # recorded with the old arrays
         if self.implicit is not None:
-            self.implicit.forget_recorded()
+            self.implicit.follow_constraints()
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Refuse indenters: contact is computed by `LatticeEngine` only.

@@ -19,6 +19,7 @@ from naibu._numba.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import NODES, PLAIN, PRICE, assemble, build, no_contacts
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple
+from naibu.mechanics.lattices.model.hat_functions import corner_weights
 from naibu.mechanics.lattices.model.lattice import Lattice
 
 _LEAST = 3.5  # spacings between coarse nodes; closer ones take more work than iterations
@@ -120,25 +121,11 @@ def _hats(points: FloatArray, cells: IntArray) -> tuple[IntArray, FloatArray, In
     """Return the hat functions of points (n, 8) on a grid over all of them, without gaps, their weights, and the grid's numbers."""
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
     place = (points - low) * np.divide(cells, extent, out=np.zeros(3), where=extent > 0.0)
-    corner, weight = _corners(place, cells)
+    corner, weight = corner_weights(place, cells)
     used, number = np.unique(corner[weight > 0.0], return_inverse=True)
     nodes = np.zeros(corner.shape, dtype=np.int64)
     nodes[weight > 0.0] = number.ravel()
     return nodes, weight, used
-
-
-def _corners(place: FloatArray, cells: IntArray) -> tuple[IntArray, FloatArray]:
-    """Return the eight nodes around places, in units of cells, as numbers on the grid, and their weights."""
-    nearest = np.rint(place)
-    place = np.where(np.abs(place - nearest) < 1e-6, nearest, place)
-    low = np.minimum(place.astype(np.int64), cells - 1)
-    t, shape = place - low, cells + 1
-    corner, weight = [], []
-    for side in np.ndindex(2, 2, 2):
-        at = low + np.array(side)
-        corner.append(at[:, 0] + shape[0] * (at[:, 1] + shape[1] * at[:, 2]))
-        weight.append(np.prod(np.where(np.array(side, dtype=bool), t, 1.0 - t), axis=1))
-    return np.stack(corner, axis=1), np.stack(weight, axis=1)
 
 
 def _add_masses(dense: FloatArray, mass: FloatArray, corner: IntArray, weight: FloatArray, count: int) -> None:
@@ -168,7 +155,7 @@ def _steps(place: FloatArray, cells: IntArray, used: IntArray, pad: int, parts: 
         same, ones = np.arange(count), np.ones(count)
         columns, rows = _lanes(same, same, ones, 0, pad), _lanes(same, same, ones, WIDTH, count + WIDTH)
         counts, last = (count, count), place
-    corner, weight = _corners(last, cells)
+    corner, weight = corner_weights(last, cells)
     most = np.argsort(-weight, axis=1, kind="stable")[:, : int((weight > 0.0).sum(axis=1).max(initial=1))]
     corner, weight = np.take_along_axis(corner, most, axis=1), np.take_along_axis(weight, most, axis=1)
     node = np.minimum(np.searchsorted(used, corner), len(used) - 1)
