@@ -35,6 +35,7 @@ COMMANDS: dict[str, tuple[str | None, str]] = {
     "mammography_population": (None, "mammography_population.py --out naibu-breasts-results --first 120 --breasts 50 --record"),
     "surface_cutting": (None, "surface_cutting.py"),
     "volume_cutting": (None, "volume_cutting.py"),
+    "cut_strokes": ("cut_strokes.py 4", "cut_strokes.py"),
     "large_volumes": (None, "large_volumes.py --sizes 160 256 --peers --record"),
     "live_page": (None, "live_page.py --record"),
     "sensing_chip": (None, "sensing_chip.py"),

@@ -1,16 +1,21 @@
 """A lattice from moduli beside the elastic solid: force and displacement of a pressed block with a stiff lump, ``lattice_moduli.py``.
 
-A cube of 60 mm (12 kPa) with a ball of 15 mm radius (36 kPa) in its middle sticks to a floor and to a plate that goes down by 1 % or aside
-by 1 %. Springs come from `elastic_stiffness`; the solid is solved with linear tetrahedra (12 and 24 a side, forces extrapolated) at
-Poisson's ratio 1/4, which is that of the lattice, and at 0.4, which it cannot have. `force` is that of the plate, lattice over solid less
-one; `points` the root mean square difference of displacements at the nodes inside, over that of the solid's displacements. `uniform` is the
-force where K is 16/30, 8/30 and 3/30 E h for all elements, at the surface as inside, and `kuhn` that of springs on the edges of Kuhn's
-tetrahedra by volumes. Small strain.
+    python benchmarks/lattice_moduli.py cube             # 60 mm a side, a ball of 15 mm radius in its middle
+    python benchmarks/lattice_moduli.py slab column      # 60 x 60 x 30 mm and 30 x 30 x 60 mm, a ball of 10 mm radius off their middles
+
+A block (12 kPa) with a ball (36 kPa) sticks to a floor and to a plate that goes down or aside by 1 % of 60 mm; `cells` are those
+along 60 mm. Springs come from `elastic_stiffness`; the solid is solved with linear tetrahedra (12 and 24 along 60 mm, forces
+extrapolated) at Poisson's ratio 1/4, which is that of the lattice, and at 0.4, which it cannot have. `force` is that of the plate,
+lattice over solid less one; `points` the root mean square difference of displacements at the nodes inside, over that of the solid's
+displacements. `uniform` is the force where K is 16/30, 8/30 and 3/30 E h for all elements, at the surface as inside, and `kuhn` that of
+springs on the edges of Kuhn's tetrahedra by volumes. Small strain.
 """
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -28,20 +33,39 @@ from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.primitives import box
 
 Array = NDArray[np.float64]
-SIDE, RADIUS, SOFT, STIFF = 60.0, 15.0, 12.0, 36.0
+LENGTH, SOFT, STIFF = 60.0, 12.0, 36.0
 SOLID_CELLS = (12, 24)
+POISSON_RATIOS = (0.25, 0.4)
 LOADS = {"down": np.array([0.0, 0.0, -0.6]), "aside": np.array([0.6, 0.0, 0.0])}
 
 
-def modulus(points: Array) -> Array:
-    """Young's modulus, kPa, at points (3, ...)."""
-    return np.where(sum((x - SIDE / 2) ** 2 for x in points) < RADIUS**2, STIFF, SOFT)
+class Block(NamedTuple):
+    """Edge lengths, middle and radius of the ball, mm; it begins at the origin."""
+
+    size: tuple[float, float, float]
+    middle: tuple[float, float, float]
+    radius: float
+
+    def modulus(self, points: Array) -> Array:
+        """Young's modulus, kPa, at points (3, ...)."""
+        return np.where(sum((x - m) ** 2 for x, m in zip(points, self.middle, strict=True)) < self.radius**2, STIFF, SOFT)
+
+    def divided(self, cells: int) -> tuple[int, int, int]:
+        """Number of cells along x, y and z, where there are `cells` along `LENGTH`."""
+        x, y, z = (round(cells * length / LENGTH) for length in self.size)
+        return x, y, z
+
+    def meshed(self, cells: int) -> Mesh:
+        """Return tetrahedra."""
+        mesh = to_tetra(box(self.size, self.divided(cells)))
+        return replace(mesh, points=mesh.points - mesh.points.min(axis=0))
 
 
-def meshed(cells: int) -> Mesh:
-    """Return tetrahedra of the cube, which begins at the origin."""
-    mesh = to_tetra(box((SIDE, SIDE, SIDE), (cells, cells, cells)))
-    return replace(mesh, points=mesh.points - mesh.points.min(axis=0))
+BLOCKS = {
+    "cube": Block((60.0, 60.0, 60.0), (30.0, 30.0, 30.0), 15.0),
+    "slab": Block((60.0, 60.0, 30.0), (22.5, 35.0, 15.0), 10.0),
+    "column": Block((30.0, 30.0, 60.0), (16.0, 13.0, 37.5), 10.0),
+}
 
 
 def solved(matrix: sp.spmatrix, fixed: Array, given: Array) -> Array:
@@ -70,17 +94,17 @@ def lattice_answer(lattice: Lattice, k: Array, load: Array) -> tuple[float, Arra
     return float((matrix @ found).reshape(-1, 3)[top].sum(axis=0) @ load / np.linalg.norm(load)), found.reshape(-1, 3)
 
 
-def solid_answer(poisson: float, load: Array) -> tuple[float, Array, Array]:
+def solid_answer(block: Block, poisson: float, load: Array) -> tuple[float, Array, Array]:
     """Return the force, extrapolated from two meshes, and nodes and displacements of the finer one."""
     forces = []
     for cells in SOLID_CELLS:
-        mesh = meshed(cells)
+        mesh = block.meshed(cells)
         corners = mesh.points[mesh.cells]
         weights = np.random.default_rng(0).dirichlet(np.ones(4), 64)
-        young = modulus(np.einsum("qc,tcd->dqt", weights, corners)).mean(axis=0)
+        young = block.modulus(np.einsum("qc,tcd->dqt", weights, corners)).mean(axis=0)
         body = LinearBody.of(mesh)
         lame, shear = young * poisson / ((1 + poisson) * (1 - 2 * poisson)), young / (2 * (1 + poisson))
-        top, floor = mesh.points[:, 2] > SIDE - 1e-6, mesh.points[:, 2] < 1e-6
+        top, floor = mesh.points[:, 2] > block.size[2] - 1e-6, mesh.points[:, 2] < 1e-6
         constrained = np.repeat((top | floor)[:, None], 3, axis=1)
         found = body.solve(lame, shear, PrescribedDisplacement(constrained, np.where(top[:, None], load, 0.0)))
         forces.append(float(body.forces(lame, shear, found)[top].sum(axis=0) @ load / np.linalg.norm(load)))
@@ -88,34 +112,43 @@ def solid_answer(poisson: float, load: Array) -> tuple[float, Array, Array]:
     return (ratio * forces[1] - forces[0]) / (ratio - 1.0), mesh.points, found
 
 
-def main() -> None:
-    """Print the table."""
-    solids = {(nu, name): solid_answer(nu, load) for nu in (0.25, 0.4) for name, load in LOADS.items()}
-    print("load    cells  Poisson's ratio   force      points    uniform    kuhn")
-    for name, load in LOADS.items():
+def table_of(name: str, block: Block) -> None:
+    """Print the rows of a block."""
+    solids = {(nu, way): solid_answer(block, nu, load) for nu in POISSON_RATIOS for way, load in LOADS.items()}
+    for way, load in LOADS.items():
         for cells in (4, 6, 8, 12):
-            h = SIDE / cells
-            lattice = classic_lattice(box_mask((cells, cells, cells)), h, density=1e-6)
+            h = LENGTH / cells
+            lattice = classic_lattice(box_mask(block.divided(cells)), h, density=1e-6)
             assert lattice.cells is not None
             inside = lattice.points[lattice.cells].min(axis=1)[:, :, None] + h * (np.indices((6, 6, 6)).reshape(3, -1) + 0.5) / 6
-            young = modulus(inside.transpose(1, 0, 2)).mean(axis=1)
+            young = block.modulus(inside.transpose(1, 0, 2)).mean(axis=1)
             force, moved = lattice_answer(lattice, elastic_stiffness(lattice, young), load)
             middle = lattice.points[lattice.elements].mean(axis=1).T
-            same = modulus(middle) * h * np.array([16.0, 8.0, 3.0])[lattice.element_class] / 30.0
+            same = block.modulus(middle) * h * np.array([16.0, 8.0, 3.0])[lattice.element_class] / 30.0
             uniform, _ = lattice_answer(lattice, same, load)
-            kuhn, springs = volumetric_lattice(meshed(cells), density=1e-6, young_modulus=1.0)
-            tied, _ = lattice_answer(kuhn, springs.stiffness * modulus(kuhn.points[kuhn.elements].mean(axis=1).T), load)
+            kuhn, springs = volumetric_lattice(block.meshed(cells), density=1e-6, young_modulus=1.0)
+            tied, _ = lattice_answer(kuhn, springs.stiffness * block.modulus(kuhn.points[kuhn.elements].mean(axis=1).T), load)
             core = ~lattice.surface_node
-            for nu in (0.25, 0.4):
-                of_solid, nodes, found = solids[nu, name]
+            for nu in POISSON_RATIOS:
+                of_solid, nodes, found = solids[nu, way]
                 far, number = cKDTree(nodes).query(lattice.points[core])
                 assert far.max() < 1e-6
                 there = found[number]
                 error = np.sqrt(((moved[core] - there) ** 2).sum() / (there**2).sum())
                 print(
-                    f"{name:7s} {cells:4d}  {nu:12.2f} {100 * (force / of_solid - 1):+12.1f} % {100 * error:8.1f} % "
-                    f"{100 * (uniform / of_solid - 1):+8.1f} % {100 * (tied / of_solid - 1):+8.1f} %"
+                    f"{name:8s}{way:7s} {cells:4d}  {nu:12.2f} {100 * (force / of_solid - 1):+12.1f} % {100 * error:8.1f} % "
+                    f"{100 * (uniform / of_solid - 1):+8.1f} % {100 * (tied / of_solid - 1):+8.1f} %",
+                    flush=True,
                 )
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("blocks", nargs="*", choices=[[], *BLOCKS], help="cube, slab, column; all by default")
+    print("block   load    cells  Poisson's ratio   force      points    uniform    kuhn")
+    for name in parser.parse_args().blocks or BLOCKS:
+        table_of(name, BLOCKS[name])
 
 
 if __name__ == "__main__":

@@ -6,13 +6,14 @@ Frames have the budget of `naibu live`: a step that takes longer goes on in the 
 `static` compares the rest under the tool with the offline solution of `QuasiStaticSession`.
 
 Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [--tool plate] [--speed 24] [--repeatable]
-[--static | --cut | --drag]``; a number N is a box of 6 N^3 tetrahedra, nu 0.499.
+[--static | --cut | --drag | --rub]``; a number N is a box of 6 N^3 tetrahedra, nu 0.499.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +21,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.rigid_transform import RigidTransform
 from naibu.mechanics import Assembler, DynamicEngine, QuasiStaticEngine, RealTimeEngine, elements, material, spherical_indenter
+from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
 from naibu.meshing import box, to_tetra
@@ -28,6 +30,7 @@ from naibu.workflows import tools_for, touchable
 from naibu.workflows.interactive.live import BUDGET_S
 
 FRAME_S = 1.0 / 60.0
+SHEARED_MM = 6.0
 SETTLE, PUSH, HOLD, LEAVE = 30, 40, 40, 20  # frames
 
 
@@ -204,6 +207,53 @@ def dragged(body: FiniteElementBody) -> None:
         simulation.close()
 
 
+def rubbed(body: FiniteElementBody) -> None:
+    """Cut a body right through under its weight, with friction of 0.4 between the sides, let it settle, and shear it to and fro by its top.
+
+    Two cuts, one nearly level and one oblique. Tangents are renewed at fixed steps, so that only the times differ from run to run.
+    """
+    low, high = body.points.min(axis=0), body.points.max(axis=0)
+    middle = 0.5 * (low + high)
+    still = replace(body, engine=replace(body.engine, background=False), lips_friction=0.4)
+    for rise in (2.0, 12.0):
+        simulation = InteractiveSimulation(still, {})
+        for _ in range(SETTLE):
+            simulation.advance()
+        spent = time.process_time()
+        ends = ((low[1] - 30.0, middle[2] + rise), (high[1] + 30.0, middle[2] - rise))
+        simulation.begin_cut([[[x, y, z] for y, z in ends] for x in (low[0] - 30.0, high[0] + 30.0)])
+        simulation.finish_cut(wait=True)
+        opened = time.process_time() - spent
+        pairs = sum(len(lips.pairs) for lips in lips_of(simulation.body.engine.assembler))
+        print(f"cut, {len(simulation.body.cells)} cells, {pairs} pairs: opens after {opened:.1f} s of a processor", flush=True)
+        timed(simulation, "settling", [None] * 60)
+        top = int(np.argmin(np.linalg.norm(simulation.body.points - [middle[0], middle[1], high[2]], axis=1)))
+        simulation.grip(top, 0.4 * simulation.extent_mm)
+        at = simulation.last.positions[top]
+        ways = SHEARED_MM * np.sin(2.0 * np.pi * np.arange(1, 61) / 60.0)
+        timed(simulation, "sheared to and fro", [at + np.array([way, 0.0, 0.0]) for way in ways])
+        simulation.close()
+
+
+def timed(simulation: InteractiveSimulation, name: str, places: Sequence[FloatArray | None]) -> None:
+    """Take frames, the gripped nodes led to these places, and print their times and what was out of balance."""
+    ms, left, failed = [], [], 0
+    for place in places:
+        if place is not None:
+            simulation.pull(place)
+        processor = time.thread_time()
+        frame = simulation.advance()
+        ms.append(1e3 * (time.thread_time() - processor))
+        left.append(100.0 * frame.unbalanced)
+        failed += bool(frame.failed)
+    loose = np.count_nonzero(np.array(left) > 5.0)
+    print(
+        f"{name}, {len(ms)} frames: {1e-3 * sum(ms):.1f} s of a processor, median {np.median(ms):.1f} ms, p95 {np.quantile(ms, 0.95):.0f}, "
+        f"worst {max(ms):.0f}; out of balance {np.median(left):.1f} %, at most {max(left):.0f} %, above 5 % in {loose}; failed {failed}",
+        flush=True,
+    )
+
+
 def report(name: str, run: Run) -> None:
     median, high = np.median(run.ms), np.quantile(run.ms, 0.99)
     print(
@@ -223,6 +273,7 @@ def main() -> None:
     parser.add_argument("--static", action="store_true")
     parser.add_argument("--cut", action="store_true", help="only time a cut")
     parser.add_argument("--drag", action="store_true", help="only drag a sphere across a cut and back")
+    parser.add_argument("--rub", action="store_true", help="only cut through with friction, and shear")
     parser.add_argument("--repeatable", action="store_true", help="tangents at fixed steps, whose time is left out")
     given = parser.parse_args()
     body = body_named(given.body)
@@ -232,6 +283,9 @@ def main() -> None:
         return
     if given.drag:
         dragged(body)
+        return
+    if given.rub:
+        rubbed(body)
         return
     fast = (
         touched(repeatable(body), given.tool, given.speed, clock_of_tangents())

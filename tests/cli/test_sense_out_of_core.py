@@ -60,3 +60,33 @@ def test_scans_larger_than_the_memory_are_measured_block_by_block(
     wanted = green_lagrange_strain(displacement, read_volume("moved/mask.zarr"))
     np.testing.assert_array_equal(strain[..., 2], wanted[..., 2, 2].astype(np.float32))
     np.testing.assert_array_equal(strain[..., 4], wanted[..., 0, 2].astype(np.float32))
+
+
+def test_bad_scans_are_refused_and_leave_nothing_to_resume(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shape, rng = (70, 72, 74), np.random.default_rng(2)
+    scan = rng.standard_normal(shape).astype(np.float32)
+    holed, small = scan.copy(), np.zeros(shape, np.uint8)
+    holed[40, 20, 60], small[:3] = np.nan, 1
+    volumes = {
+        "scan": scan, "moved": np.roll(scan, 1, 2), "holed": holed, "unknown": np.full(shape, np.nan, np.float32), "lower": scan[:60],
+        "constant": np.full(shape, 7, np.int16), "zero": np.zeros(shape, np.uint8), "small": small, "slice": scan[:1],
+    }  # fmt: skip
+    for name, values in volumes.items():
+        write_volume(Path(f"{name}.zarr"), Volume.from_array(values, spacing_mm=(1.0, 1.0, 1.0), missing=True))
+    for words, expected in (
+        ("constant scan", ("reference", "constant", "7")),
+        ("scan unknown", ("deformed", "every voxel is NaN")),
+        ("holed moved", ("a voxel near", "reference", "NaN")),
+        ("scan lower", ("deformed", "different grids", "70")),
+        ("slice slice", ("74 x 72 x 1 voxels", "lucas-kanade")),
+        ("scan moved --mask zero", ("--mask", "empty")),
+        ("scan moved --mask small", ("mask spans [37, 36, 3] voxels",)),
+        ("scan moved --mask lower", ("mask", "different grids", "60")),
+    ):
+        files = [word if word.startswith("-") else f"{word}.zarr" for word in words.split()]
+        code, _, said = naibu(monkeypatch, capsys, "sense", *files, "--memory-gb", GIGABYTES, "-o", "out")
+        assert code == 2 and all(part in said for part in expected), said
+        assert not [path for path in Path("out").rglob("*") if path.is_file()]

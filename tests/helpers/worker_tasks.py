@@ -3,7 +3,11 @@
 import os
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from naibu.core.errors import ConvergenceError
 from naibu.core.progress import Progress, report_progress
@@ -39,3 +43,13 @@ def dying(times: int, counter: str, progress: Progress | None) -> int:
 def sleeping(seconds: float, pid_file: str, progress: Progress | None) -> None:
     Path(pid_file).write_text(str(os.getpid()))
     time.sleep(seconds)
+
+
+def killed_at(
+    function: Callable[..., Any], victim: tuple[str, Any], times: int, counter: str, progress: Progress | None, **arguments: Any
+) -> Any:
+    """Call a task's function, but kill the own process the first `times` times that an argument has the value of the `victim`."""
+    name, value = victim
+    if np.array_equal(arguments[name], value):
+        dying(times, counter, progress)
+    return function(**arguments, progress=progress)

@@ -50,7 +50,7 @@ def files(press: Press, tmp_path_factory: pytest.TempPathFactory) -> Files:
         values = np.zeros(shape, dtype=np.uint8)
         values.flat[:ones] = 1
         write_volume(root / f"{name}.mha", Volume.from_array(values, spacing_mm=(1.0, 1.0, 1.0)))
-    named = {**touched_bodies(root), **views(root), **measured_field(root), **recorded_readings(root)}
+    named = {**damaged_scans(root), **touched_bodies(root), **views(root), **measured_field(root), **recorded_readings(root)}
     scans = {name: root / f"{name}.mha" for name in ("scan", "scan2", "scan3", "frames", "zero", "voxel")}
     tables = {"table": press.folder / "initial.csv", "table2": press.folder / "pressed.csv"}
     records = {"cloud": "t,x,y,z\n0,10,10,20\n0,20,10,20\n", "sensor": "t,fx,fy,fz\n" + "".join(f"0.0{k},0,0,-{k}\n" for k in range(1, 9))}
@@ -58,6 +58,26 @@ def files(press: Press, tmp_path_factory: pytest.TempPathFactory) -> Files:
         (root / f"{name}.csv").write_text(text, encoding="utf-8")
         named[name] = root / f"{name}.csv"
     return {**named, **scans, **tables, "press": press.folder, "model": press.results / "model.json", "study": study_file(root)}
+
+
+def damaged_scans(root: Path) -> Files:
+    """Scans on the grid of the good ones, or on others, that show nothing, or not the same, and a label where nothing can be matched."""
+    rng, shape = np.random.default_rng(1), (10, 12, 14)
+    scan = rng.random(shape).astype(np.float32)
+    upper, lower, holed, steep = (scan.copy() for _ in range(4))
+    upper[:5], lower[5:], holed[4, 5, 6], steep[4, 5, 6] = np.nan, np.nan, np.nan, 1e30
+    small = np.zeros(shape, dtype=np.uint8)
+    small[:3] = 1
+    volumes = {
+        "unknown": np.full(shape, np.nan, np.float32), "constant": np.full(shape, 7, np.int16), "upper": upper, "lower": lower,
+        "holed": holed, "steep": steep, "slice": scan[:1], "thin": scan[:3], "small": small, "stretched": scan, "shifted_scan": scan,
+    }  # fmt: skip
+    for name, values in volumes.items():
+        spacing, origin = (1.0, 1.0, 1.0 + 0.2 * (name == "stretched")), (3.0 * (name == "shifted_scan"), 0.0, 0.0)
+        write_volume(root / f"{name}.mha", Volume.from_array(values, spacing_mm=spacing, origin_mm=origin, missing=True))
+    flat = (root / "slice.mha").read_bytes()
+    (root / "spaceless.mha").write_bytes(flat.replace(b"ElementSpacing = 1.0 1.0 1.0", b"ElementSpacing = 0.0 1.0 1.0"))
+    return {name: root / f"{name}.mha" for name in (*volumes, "spaceless")}
 
 
 def touched_bodies(root: Path) -> Files:

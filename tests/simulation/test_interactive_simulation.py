@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -177,6 +178,7 @@ def test_frames_that_leave_their_step_to_the_next_come_to_the_same_states() -> N
                     assert frames[-1].number > before.number
                     assert frames[-1].time_s == before.time_s
                     assert frames[-1].positions is before.positions
+                    assert frames[-1].unbalanced == before.unbalanced
                 touched.move((20.0, 20.0, height))
         assert any(frame.under_way for frame in frames) == (budget == 0.0)
         ends.append([np.vstack([f.positions, f.force, f.tool_centre]) for f in frames if not f.under_way])
@@ -264,7 +266,12 @@ def test_a_nearly_incompressible_body_goes_on_in_real_time_behind_a_cut() -> Non
     for _ in range(30):
         touched.advance()
     touched.begin_cut([[[x, -5.0, 24.0], [x, 30.0, 24.0]] for x in (-5.0, 65.0)])
-    assert touched.finish_cut(wait=True)
+    stages = [touched.cut_stage]
+    while not touched.finish_cut():
+        stages.append(touched.cut_stage)
+        time.sleep(0.01)
+    assert touched.cut_stage == -1 and min(stages) == 0
+    assert stages == sorted(stages)
     before = touched.last.positions
     for _ in range(5):
         frame = touched.advance()

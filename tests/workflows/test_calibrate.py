@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import worker_tasks
 from lattice_studies import study_file
 from notebooks import check_shown
 
@@ -18,9 +22,11 @@ from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.study_model import StudyModel
 from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.workflows.parallel.task import Task
+from naibu.workflows.studies import calibration_starts
 from naibu.workflows.studies.calibrate import calibrate_study
 from naibu.workflows.studies.calibration_example import write_calibration_example
-from naibu.workflows.studies.calibration_starts import StartedSearch, best_of
+from naibu.workflows.studies.calibration_starts import StartedSearch, best_of, starting_values
 from naibu.workflows.studies.lattice_study import prepared_study
 
 STUDY = """
@@ -150,6 +156,31 @@ def test_several_starts_agree_whoever_computes_them(inputs: tuple[Path, Path, Pa
     assert len(told) == 3 and not any(row["fits_as_well_elsewhere"] or row["error"] for row in told)
     assert max(row["start"]["K"] for row in told) > 2.0 * min(row["start"]["K"] for row in told)
     assert "Where the searches ended" in runs[1].files[0].read_text(encoding="utf-8")
+
+
+def test_a_worker_that_is_killed_costs_its_search_only(
+    inputs: tuple[Path, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study, cloud, sensor = inputs
+    options: dict[str, Any] = {"shapes": [cloud], "forces": [sensor], "groups": "all", "point_sd_mm": 0.05, "starts": 3, "seed": 1}
+    whole = calibrate_study(study, out=tmp_path / "whole", **options)
+    searches = json.loads(whole.files[1].read_text(encoding="utf-8"))["starts"]
+    victim = ("start", starting_values(whole.estimate.unknowns, 3, 1)[2])
+    found = {}
+    for times in (1, 99):
+        begun = str(tmp_path / f"begun {times}")
+
+        def task(name: str, function: Callable[..., Any], arguments: dict[str, Any], times: int = times, begun: str = begun) -> Task:
+            return Task(name, partial(worker_tasks.killed_at, function, victim, times, begun), arguments)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(calibration_starts, "Task", task)
+            run = calibrate_study(study, out=tmp_path / f"killed {times}", workers=2, **options)
+        assert Path(begun).read_text() == "xx"
+        np.testing.assert_allclose(run.estimate.values, whole.estimate.values, rtol=0.01 if times > 1 else 1e-12)
+        found[times] = json.loads(run.files[1].read_text(encoding="utf-8"))["starts"]
+    assert found[1] == searches
+    assert found[99][:2] == searches[:2] and "start 3: its worker died twice" in found[99][2]["error"]
 
 
 def test_values_that_fit_as_well_widen_the_intervals(inputs: tuple[Path, Path, Path]) -> None:

@@ -127,6 +127,7 @@ export class Body {
       const mixed = from.map((v, k) => v + t * (to[k] - v));
       box.position.fromArray(mixed, 0);
       box.scale.fromArray(mixed, 3);
+      box.quaternion.fromArray(mixed, 6).normalize();
     });
   }
 

@@ -1,6 +1,7 @@
 // The live page: builds view and controls in #naibu-live, and leads the tools by mouse, touch, keyboard and gamepad.
 import { Vector3 } from "three";
 import { tableGradient } from "./colormap.js";
+import { CutNotice } from "./cut-notice.js";
 import { canDrawOr, h } from "./elements.js";
 import { decodeScene } from "./live-decode.js";
 import { LiveLink } from "./live-link.js";
@@ -38,6 +39,7 @@ const WRITE_MS = 100; // from one reading of the numbers to the next
 const CURVE_MS = 50; // from one drawing of the curves to the next
 const UNBALANCED = 0.05; // of all forces, above which the badge says so
 const digits = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
+const CONFLICTS = new Set(["cut", "tool", "grip", "undo", "reset"]); // with a cut under way: another body comes of it, or none
 const newtons = (force) => Math.hypot(...force) / 1000;
 
 class LivePage {
@@ -51,7 +53,7 @@ class LivePage {
     this.tool = scene.tools.length ? scene.tools[0].name : "";
     this.#build(root);
     this.view = new LiveView(this.stage);
-    this.stage.append(this.readout);
+    this.stage.append(this.readout, this.notice.element);
     this.view.show(scene);
     this.view.listenToKeys(this.#keys());
     this.curve = new TimeCurve(this.canvas, "force (N)");
@@ -60,7 +62,7 @@ class LivePage {
     this.setMode("push");
     this.link = new LiveLink(token, {
       onFrame: (frame) => this.#show(frame),
-      onTrouble: (text) => this.#say(text),
+      onTrouble: (text) => this.#refused(text),
       onState: (state, text) => this.#connected(state, text),
     });
   }
@@ -88,12 +90,16 @@ class LivePage {
     this.canvas = h("canvas", { class: "time-curve", role: "img", "aria-label": "Force of the last ten seconds" });
     this.numbers = Object.fromEntries(["force", "pull", "penetration", "time", "rate", "probe"].map((name) => [name, h("dd", {}, "–")]));
     this.plots = new ReadingPlots(this.scene.readings);
+    this.notice = new CutNotice(this.scene.cut_stages);
+    this.undo = this.#button("↺ Undo", () => this.back("undo"));
+    this.reset = this.#button("Reset", () => this.back("reset"));
+    this.conflicting = [...this.modes.filter((b) => ["cut", "pull"].includes(b.dataset.mode)), this.toolChoice, this.undo, this.reset];
     const labels = { force: "force of the tool", pull: "force of the pull", penetration: "penetration", time: "simulated time", rate: "rate", probe: "probed point" };
     const list = h("dl", { class: "numbers" }, ...Object.entries(labels).flatMap(([name, text]) => [h("dt", {}, text), this.numbers[name]]));
     root.replaceChildren(
       h("div", { class: "bar" }, h("div", { class: "modes", role: "group", "aria-label": "What dragging does" }, ...this.modes),
-        h("span", { class: "pair" }, h("label", { for: "naibu-tool" }, "Tool"), this.toolChoice), this.pause, this.#button("↺ Undo", () => this.back("undo")),
-        this.#button("Reset", () => this.back("reset")), this.#button("Whole view", () => this.view.look("oblique"))),
+        h("span", { class: "pair" }, h("label", { for: "naibu-tool" }, "Tool"), this.toolChoice), this.pause, this.undo, this.reset,
+        this.#button("Whole view", () => this.view.look("oblique"))),
       h("div", { class: "live-grid" },
         h("div", {}, this.stage, this.hint, h("div", { class: "motion-scale" }, this.gradient, this.ticks), this.#viewControls()),
         h("div", { class: "live-side" }, this.badge, this.message, list, this.canvas,
@@ -145,8 +151,18 @@ class LivePage {
 
   /** Send a command; those that steer are not sent by a page that only watches. */
   command(type, values = {}, always = false) {
-    if (this.frame?.driving || always) this.link.send({ type, ...values });
-    else this.#say("Another page drives this simulation; this one watches.");
+    if (!this.frame?.driving && !always) this.#say("Another page drives this simulation; this one watches.");
+    else if (this.notice.cutting && CONFLICTS.has(type)) this.#say("A cut is being computed: wait until it opens.");
+    else {
+      this.link.send({ type, ...values });
+      if (type === "cut") this.notice.ask();
+    }
+  }
+
+  /** The server says what was wrong with a command. */
+  #refused(text) {
+    this.#say(text);
+    this.notice.forget();
   }
 
   /** Undo or reset: keys lead the tool from where it is then. */
@@ -281,6 +297,7 @@ class LivePage {
 
   #show(frame) {
     if (frame.topology !== this.scene.topology) {
+      this.notice.forget();
       this.#renew();
       return;
     }
@@ -294,6 +311,8 @@ class LivePage {
     this.plots.add(frame.time, frame.readings);
     this.#markProbed();
     this.#badge(frame);
+    this.notice.follow(frame, performance.now());
+    this.conflicting.forEach((control) => { if (control.disabled !== this.notice.cutting) control.disabled = this.notice.cutting; });
     this.#write(frame, performance.now());
     this.stage.setAttribute("data-ready", "1");
   }
@@ -383,6 +402,7 @@ class LivePage {
 
   #connected(state, text = "") {
     this.#say(text);
+    this.notice.forget();
     if (state !== "connected") this.badge.textContent = "not connected";
     this.badge.dataset.held = String(state === "connected");
   }

@@ -43,6 +43,7 @@ export class LiveView extends View {
     const [first, clip, marked, mesh] = [!this.scene, this.clip, this.markers?.visible, this.skin?.material.wireframe];
     this.scene = scene;
     this.clear();
+    [this.fine, ...(this.coarse?.values() ?? [])].forEach((geometry) => geometry?.dispose()); // those that were not drawn last
     this.world = new Scene();
     this.sun = new DirectionalLight(0xffffff, 1.4);
     this.position = new BufferAttribute(scene.points.slice(), 3).setUsage(DynamicDrawUsage);
@@ -50,7 +51,9 @@ export class LiveView extends View {
     this.top ??= 1;
     this.skin = this.#coloured(this.position, this.level);
     this.whole = new BufferAttribute(scene.faces, 1);
-    this.skin.geometry.setIndex(this.whole);
+    this.fine = this.skin.geometry;
+    this.fine.setIndex(this.whole);
+    this.fine.userData.shown = null;
     this.coarse = new Map();
     this.picked = this.#pickable();
     this.drawn = null;
@@ -103,10 +106,15 @@ export class LiveView extends View {
     this.look("oblique");
   }
 
-  #coloured(position, level) {
+  #geometry(position, level) {
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", position);
     geometry.setAttribute("level", level);
+    return geometry;
+  }
+
+  #coloured(position, level) {
+    const geometry = this.#geometry(position, level);
     const material = new ShaderMaterial({
       vertexShader: `#include <clipping_planes_pars_vertex>\n${VERTEX.replace("gl_Position =", "vec4 mvPosition = p;\n  #include <clipping_planes_vertex>\n  gl_Position =")}`,
       fragmentShader: `#include <clipping_planes_pars_fragment>\n${FRAGMENT.replace("void main() {", "void main() {\n  #include <clipping_planes_fragment>")}`,
@@ -162,9 +170,7 @@ export class LiveView extends View {
     if (!this.#changed(frame)) return;
     this.drawn = frame;
     this.position.array = frame.positions; // that of the message, not a copy
-    this.position.needsUpdate = true;
     this.outline.follow();
-    this.#setLevels(frame);
     this.tools.forEach((tool, k) => {
       tool.visible = k === frame.tool;
       if (!tool.visible) return;
@@ -188,11 +194,24 @@ export class LiveView extends View {
     return frame.values !== null && frame.values.some((v, i) => Math.abs(v - drawn.values[i]) > SEEN_COLOUR * this.top);
   }
 
-  #setLevels({ positions: moved, values }) {
+  /** Pass on where the nodes of a geometry are, and their colours, unless it has them already. */
+  #fill(geometry) {
+    const { position, level } = geometry.attributes;
+    const { shown, nodes } = geometry.userData;
+    if (shown === this.drawn) return;
+    geometry.userData.shown = this.drawn;
+    const from = this.position.array;
+    if (nodes) for (let k = 0; k < nodes.length; k += 1) for (let a = 0; a < 3; a += 1) position.array[3 * k + a] = from[3 * nodes[k] + a];
+    position.needsUpdate = level.needsUpdate = true;
+    this.#setLevels(from, this.drawn?.values ?? null, level.array, nodes);
+  }
+
+  /** Set what the colours stand for, of these nodes or of all of them, and their scale. */
+  #setLevels(moved, values, out, nodes) {
     const { points } = this.scene;
-    const out = this.level.array;
     let [largest, smallest] = [0, 0];
-    for (let i = 0; i < out.length; i += 1) {
+    for (let k = 0; k < out.length; k += 1) {
+      const i = nodes ? nodes[k] : k;
       let value;
       if (values) value = values[i];
       else {
@@ -201,7 +220,7 @@ export class LiveView extends View {
         const z = moved[3 * i + 2] - points[3 * i + 2];
         value = Math.sqrt(x * x + y * y + z * z); // Math.hypot guards against overflow, and is slow
       }
-      out[i] = value;
+      out[k] = value;
       if (value > largest) largest = value;
       else if (value < smallest) smallest = value;
     }
@@ -211,13 +230,13 @@ export class LiveView extends View {
     // values that are negative, such as elongations, are shown on a scale with zero in its middle
     this.signed = values !== null && (this.signed || -smallest > NEGATIVE * most);
     const [share, zero] = this.signed ? [0.5 / this.top, 0.5] : [1 / this.top, 0];
-    for (let i = 0; i < out.length; i += 1) out[i] = zero + out[i] * share;
-    this.level.needsUpdate = true;
+    for (let k = 0; k < out.length; k += 1) out[k] = zero + out[k] * share;
   }
 
   /** Draw: where a processor draws, as finely as there is time for, and again when nothing has changed for a while. */
   render() {
     if (!this.detail) {
+      this.#fill(this.fine);
       super.render();
       return;
     }
@@ -236,6 +255,7 @@ export class LiveView extends View {
   /** Draw the picture of a view at rest. */
   renderFinest() {
     if (this.detail) this.#drawAt(STILL_RATIO, Infinity);
+    else this.#fill(this.fine);
     super.render();
   }
 
@@ -249,31 +269,56 @@ export class LiveView extends View {
     if (this.renderer.getPixelRatio() !== ratio) this.renderer.setPixelRatio(ratio);
     // a section, the lines of the mesh and those of cuts belong to the whole surface
     const coarse = nodes < this.position.count && !this.clip && !this.skin.material.wireframe && !this.outline.visible;
-    if (coarse && !this.coarse.has(nodes)) {
-      this.coarse.set(nodes, new BufferAttribute(coarserSurface(this.scene.points, this.scene.faces, nodes), 1));
-    }
-    const index = coarse ? this.coarse.get(nodes) : this.whole;
-    if (this.skin.geometry.index !== index) this.skin.geometry.setIndex(index);
+    this.skin.geometry = coarse ? this.#coarser(nodes) : this.fine;
+    this.#fill(this.skin.geometry);
     // what is behind cannot be seen, and takes time; single triangles of a coarse surface may face the other way
     this.skin.material.side = this.scene.closed && !this.clip && !coarse ? FrontSide : DoubleSide;
+  }
+
+  /** The surface between so many nodes, which are passed on to the picture alone: all of them would take as long as drawing these. */
+  #coarser(most) {
+    if (!this.coarse.has(most)) {
+      const faces = coarserSurface(this.scene.points, this.scene.faces, most);
+      const nodes = Uint32Array.from(new Set(faces));
+      const place = new Map(Array.from(nodes, (node, k) => [node, k]));
+      const [position, level] = [3, 1].map((size) => new BufferAttribute(new Float32Array(size * nodes.length), size).setUsage(DynamicDrawUsage));
+      const geometry = this.#geometry(position, level);
+      geometry.setIndex(new BufferAttribute(faces.map((node) => place.get(node)), 1));
+      geometry.userData.nodes = nodes;
+      this.coarse.set(most, geometry);
+    }
+    return this.coarse.get(most);
   }
 
   #placeMarkers() {
     if (!this.markers.visible) return;
     const { nodes, weights, each } = this.scene.markers;
     const at = this.position.array;
-    const matrix = new Matrix4();
-    // a section is opaque: those within half their mean distance of it are seen on it, on either side
-    const box = this.high.map((v, a) => v - this.low[a]);
-    const slab = 0.5 * Math.cbrt((box[0] * box[1] * box[2]) / Math.max(this.markers.count, 1));
+    const places = Array.from({ length: this.markers.count }, (_, q) => {
+      const p = new Vector3();
+      for (let k = q * each; k < (q + 1) * each; k += 1) p.addScaledVector(new Vector3().fromArray(at, 3 * nodes[k]), weights[k]);
+      return p;
+    });
+    const ahead = this.clip ? places.map((p) => this.clip.distanceToPoint(p)) : [];
+    const reach = this.clip ? this.#reach(ahead) : Infinity;
     this.markers.material.depthTest = !this.clip;
-    for (let q = 0; q < this.markers.count; q += 1) {
-      const p = [0, 0, 0];
-      for (let k = q * each; k < (q + 1) * each; k += 1) for (let a = 0; a < 3; a += 1) p[a] += weights[k] * at[3 * nodes[k] + a];
-      const hidden = this.clip && Math.abs(this.clip.normal.x * p[0] + this.clip.normal.y * p[1] + this.clip.normal.z * p[2] + this.clip.constant) > slab;
-      this.markers.setMatrixAt(q, hidden ? matrix.makeScale(0, 0, 0) : matrix.makeTranslation(...p));
-    }
+    const matrix = new Matrix4();
+    places.forEach((p, q) => {
+      const hidden = this.clip && Math.abs(ahead[q]) > reach;
+      this.markers.setMatrixAt(q, hidden ? matrix.makeScale(0, 0, 0) : matrix.makeTranslation(p));
+    });
     this.markers.instanceMatrix.needsUpdate = true;
+  }
+
+  /**
+   * How far from a section, which is opaque, markers are seen on it, on either side: half their mean distance, and where it passes between
+   * them, as between the layers in which they were laid, as far as the nearest ones.
+   */
+  #reach(ahead) {
+    const box = this.high.map((v, a) => v - this.low[a]);
+    const half = 0.5 * Math.cbrt((box[0] * box[1] * box[2]) / Math.max(ahead.length, 1));
+    const [before, behind] = [1, -1].map((sign) => Math.min(...ahead.filter((v) => sign * v >= 0).map(Math.abs))); // Infinity: none
+    return Number.isFinite(before + behind) ? Math.max(half, Math.min(before, behind) + 0.5 * half) : half;
   }
 
   /** Cut the view by a plane across axis 0, 1 or 2 at a fraction of the object's extent; null shows everything. */
@@ -300,6 +345,7 @@ export class LiveView extends View {
 
   #cut() {
     if (!this.clip) return;
+    this.#fill(this.fine);
     const { normal, constant } = this.clip;
     const found = section(this.position.array, this.level.array, this.scene.cells, [normal.x, normal.y, normal.z], -constant);
     const { geometry } = this.cap;

@@ -1,5 +1,5 @@
 // The 3-D view of a result: markers, residuals and body, for the result page, the live page and the notebook.
-import { Box3, DirectionalLight, HemisphereLight, Scene, Sphere, Vector3 } from "three";
+import { Box3, DirectionalLight, HemisphereLight, Quaternion, Scene, Sphere, Vector3 } from "three";
 import { Body } from "./body.js";
 import { niceCeiling, residualColour } from "./colormap.js";
 import { Arrows, measuredGlyphs, predictedGlyphs, setPositions } from "./glyphs.js";
@@ -8,10 +8,13 @@ import { readTheme, View } from "./view.js";
 const PICK_RADIUS_PX = 16;
 const FULL = 1e-6;
 
-/** Corners of [centre x, y, z, half size x, y, z] as a flat list. */
+/** Corners of [centre x, y, z, half size x, y, z, quaternion x, y, z, w] as a flat list. */
 function boxCorners(box) {
   const signs = [-1, 1];
-  return signs.flatMap((i) => signs.flatMap((j) => signs.flatMap((k) => [i, j, k].map((s, axis) => box[axis] + s * box[3 + axis]))));
+  const centre = new Vector3().fromArray(box);
+  const turned = new Quaternion().fromArray(box, 6);
+  const corner = (i, j, k) => new Vector3(i * box[3], j * box[4], k * box[5]).applyQuaternion(turned).add(centre).toArray();
+  return signs.flatMap((i) => signs.flatMap((j) => signs.flatMap((k) => corner(i, j, k))));
 }
 
 /** Median distance of a point to its nearest neighbour; Infinity for a single one. */

@@ -141,6 +141,7 @@ def cut(
         Replace results that the folder holds.
     """
     from naibu.workflows.interactive.cut import cut as run
+    from naibu.workflows.interactive.cut import joined_text
     from naibu.workflows.interactive.cut_surface import is_surface, length_text
 
     solid = {
@@ -165,6 +166,8 @@ def cut(
     wrote(*done.files)
     sizes = ", ".join(f"{volume:.4g}" for volume in done.volumes_mm3[:6])
     say(f"{done.cut.n_pieces} piece(s) of {sizes} mm3; the cut deviates from the blade by {length_text(done.cut.deviation_mm)} at most.")
+    if earlier := joined_text(done.cut):
+        say(earlier)
     say(f"Page: {done.files[0]}   {', '.join(str(file) for file in done.files[1:])}")
 
 

@@ -32,8 +32,10 @@ from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
 from naibu.imaging.preprocessing.object_mask import mask_in_view, mask_jumps
 from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
+from naibu.imaging.preprocessing.volume_pair import require_known
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts
+from naibu.imaging.volume_correlation.results.block_displacements import LEFT
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
@@ -148,8 +150,11 @@ def measure_displacement(
         )
     if method != "default":
         _require_measured(reference, deformed)
+    views = fields_of_view(reference, deformed)
+    for volume, view, name in zip((reference, deformed), views, ("reference", "deformed"), strict=True):
+        require_known(volume, view, name)
     if mask is None:
-        view = fields_of_view(reference, deformed)[0]
+        view = views[0]
         inside = mask_in_view(reference, view)
         doubts = _mask_doubts(inside)
         # the surface has much of the contrast
@@ -365,12 +370,13 @@ def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) 
 
 
 def _in_object(found: CorrelationResult, blocks: DisplacementField, valid: BoolArray) -> DisplacementField:
-    """Return the blocks whose middle lies in a valid voxel, less certain where structures stay apart."""
+    """Return the blocks whose middle lies in a valid voxel, less certain where the splines are biased or structures stay apart."""
     z, y, x = np.clip(np.rint(found.volume.to_index(blocks.points)).astype(int)[:, ::-1], 0, np.array(valid.shape) - 1).T
     kept = valid[z, y, x]
     points, covariance = blocks.points[kept], blocks.covariance
     if covariance is not None:
-        covariance = covariance[kept] + np.nan_to_num(found.misplacement_at(points))[:, None, None] * np.eye(3)
+        left = LEFT**2 * found.bias_at(points) + found.misplacement_at(points)
+        covariance = covariance[kept] + np.nan_to_num(left)[:, None, None] * np.eye(3)
     return DisplacementField.from_arrays(points, blocks.vectors[kept], covariance=covariance)
 
 

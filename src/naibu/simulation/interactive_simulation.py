@@ -122,6 +122,11 @@ class InteractiveSimulation:
         """The last frame."""
         return self._last
 
+    @property
+    def cut_stage(self) -> int:
+        """Number in `CUT_STAGES` of what is being done for the cut that was begun; -1 where none was, or it has opened."""
+        return self._cutting.stage if self._cutting else -1
+
     def take(self, tool: str) -> None:
         """Bring a tool into play, where it waits; an empty name puts the one in play away.
 
@@ -276,9 +281,7 @@ class InteractiveSimulation:
         if self._trapped and (cutting is None or cutting.finished):
             said, self._trapped, self._cutting = self._trapped, "", None
             raise InputError(said)
-        if cutting is None:
-            return False
-        if not cutting.finished or self._next is not None:
+        if cutting is None or not cutting.finished or self._next is not None:
             return False
         self._cutting = None
         if cutting.body is not self.body:
@@ -327,11 +330,12 @@ class InteractiveSimulation:
             self._session.restore(before)
             self._target, self._rotation_target = self._centre, self._rotation
             self._pull_target = self._grip_position()
-            self._last = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, str(error))
+            again = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, str(error))
+            self._last = replace(again, unbalanced=self._last.unbalanced)
             return self._last
         if forces is None:
-            self._under_way, left = (centre, spin, gripped), self.body.unbalanced(self._session)
-            self._last = replace(self._last, number=self._last.number + 1, failed="", unbalanced=left, under_way=True)
+            self._under_way = (centre, spin, gripped)
+            self._last = replace(self._last, number=self._last.number + 1, failed="", under_way=True)
             return self._last
         way = centre - self._centre
         self._centre, self._rotation = centre, rotation_matrix(duration * spin) @ self._rotation

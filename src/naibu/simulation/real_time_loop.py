@@ -35,6 +35,8 @@ class Pace:
         Whether the loop waits.
     recording, replaying : bool
         Whether frames are being kept, or shown again.
+    cut_stage : int
+        Number in `naibu.simulation.background_cut.CUT_STAGES` of what is being done for a cut; -1 where none is under way.
     """
 
     steps_per_s: float
@@ -42,6 +44,7 @@ class Pace:
     paused: bool
     recording: bool
     replaying: bool
+    cut_stage: int = -1
 
 
 @dataclass(slots=True, eq=False)
@@ -212,4 +215,4 @@ class RealTimeLoop:
         simulated = sum(length for _, length in list(self._finished)[1:])
         ratio = simulated / span if span else 0.0
         steps = ratio * self.simulation.steps / self.simulation.frame_s
-        return Pace(steps, ratio, self._paused, self._recording, bool(self._replay))
+        return Pace(steps, ratio, self._paused, self._recording, bool(self._replay), self.simulation.cut_stage)

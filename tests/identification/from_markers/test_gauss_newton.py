@@ -19,6 +19,7 @@ from naibu.identification.from_markers.specimen.parameter_names import (
     batch_stiffness,
     pixel_scale,
     poisson_ratio,
+    side_plate_tilt,
     straight_base,
     young_modulus,
 )
@@ -56,7 +57,7 @@ def test_derivatives_of_predicted_markers(
     values = parameters.values() | {base_offset(experiment): 0.3, pixel_scale(experiment): 1.01}
     values |= dict.fromkeys(body.shift_names, 0.4)
     if body.has_unknown_base:
-        values[straight_base(experiment)] = 15.0
+        values |= {straight_base(experiment): 15.0, side_plate_tilt(experiment, state): 0.02}
     fit = matcher.evaluate(values)[0]
     near = [SolvedLoadCase(fit, parameters.with_values({p.name: values[p.name] for p in parameters.free}))]
     for k, p in enumerate(parameters.free):

@@ -15,6 +15,7 @@ from naibu.identification.from_markers.specimen.parameter_names import (
     friction,
     platen_position,
     poisson_ratio,
+    side_plate_tilt,
     straight_base,
     young_modulus,
 )
@@ -25,20 +26,21 @@ from naibu.mechanics.finite_strain.statics import solve
 from naibu.meshing.primitives import box_from_coordinates
 from naibu.meshing.quality import scaled_jacobians
 
-PATH = SolverSettings(first_step=0.1, largest_step=0.2, tolerance=1e-9)
 
-
-def test_a_quarter_deforms_as_the_whole_object_does() -> None:
+# friction remembers the load steps, which must be the same for both bodies: short ones are not divided
+@pytest.mark.parametrize(("tilt", "largest_step"), [(0.0, 0.2), (0.02, 0.05)])
+def test_a_quarter_deforms_as_the_whole_object_does(tilt: float, largest_step: float) -> None:
     """The half ellipsoid on a straight base, squeezed by a sixth: markers, gradients and reactions, computed with no symmetry assumed."""
+    settings = SolverSettings(first_step=0.5 * largest_step, largest_step=largest_step, tolerance=1e-9)
     experiment = datasets.load("ct_half_ellipsoid")
     gel, state = experiment.materials[0], "width_100"
     values = {young_modulus(gel): 200.0, poisson_ratio(gel): 0.48, straight_base(experiment): 12.0}
-    values |= {platen_position(experiment, state): 110.0}
+    values |= {platen_position(experiment, state): 110.0, side_plate_tilt(experiment, state): tilt}
     values |= {friction(gel, body): mu for body, mu in (("table", 0.2), ("acrylic", 0.1))}
     found = []
     for whole in (False, True):
         body = specimen(experiment, ModelSettings(element_size_mm=16.0), whole=whole)
-        solution = solve(body.problem(values, state), settings=PATH)
+        solution = solve(body.problem(values, state), settings=settings)
         now = body.reshaped(values)
         moved = now.at_markers(solution.displacement)
         found.append((body, moved, now.deformation_gradient(solution.displacement), body.reactions(solution), now.whole, solution))

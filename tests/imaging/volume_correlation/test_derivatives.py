@@ -132,6 +132,7 @@ def test_dilatation_force_and_gauss_newton_matrix_are_derivatives_of_the_volume_
     f, rng = fit(), np.random.default_rng(1)
     weights = rng.uniform(0.5, 2.0, len(f.system.cells))
     load = f.system.assembled(f.c, *no_data(f.system), np.zeros((len(weights), 3)), weights)
+    assert np.allclose(f.system.dilatation_load(f.c, weights), load, atol=1e-4 * np.abs(load).max())
     ratio = volume_ratios(f.system, f.c)
     assert np.ptp(ratio) > 0.1
     slopes = [(volume_ratios(f.system, f.along(v, STEP)) - volume_ratios(f.system, f.along(v, -STEP))) / (2 * STEP) for v in f.directions]

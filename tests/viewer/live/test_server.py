@@ -120,7 +120,7 @@ def test_a_frame_holds_what_the_simulation_says(running: Running) -> None:
         data = link.recv(timeout=20)
     assert isinstance(data, bytes)
     header = np.frombuffer(data[: HEADER.itemsize], HEADER)[0]
-    assert header["magic"] == b"NLV3"
+    assert header["magic"] == b"NLV4"
     assert header["nodes"] == 4
     assert header["flags"] & DRIVING
     assert header["force"].tolist() == [0.0, 0.0, -5.0]

@@ -19,6 +19,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.estimate import NO_REGIONS, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
+from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.uncertainty import Uncertainty
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.images import read_volume, write_volume
@@ -28,6 +29,7 @@ from naibu.workflows.fields.identify_fields import identify_fields, table_of_ass
 from naibu.workflows.fields.known_zones import parse_known_zones
 
 SD_MM = 0.04
+TEXTS = ("identification.json", "model.json", "report.html")
 
 
 @cache
@@ -279,7 +281,23 @@ def test_a_map_without_a_known_zone_is_relative_to_its_largest_region(folder: Pa
     other = below != below[largest]
     assert not ((young[other, 0] <= 1.0) & (young[other, 1] >= 1.0)).any()
     assert run.relative and run.unit == "multiples of the largest region" and "kPa" not in " ".join(run.notes)
-    assert "largest region" in (folder / "map" / "report.html").read_text() and (folder / "map" / "model.json").exists()
+    assert "largest region" in (folder / "map" / "report.html").read_text() and run.body.unit == run.unit
+    assert not [name for name in TEXTS if "kPa" in (folder / "map" / name).read_text()]
+
+
+def test_multiples_of_a_zone_are_nowhere_told_in_kilopascals(folder: Path) -> None:
+    """Steps and the model said kPa; models that were written so are still read."""
+    run = identify_fields(
+        folder / "field.h5", zones=folder / "labels.mha", known=["label 2"], law="linear", element_size_mm=10.0, out=folder / "multiples"
+    )
+    (young,), _ = run.estimate.intervals()
+    assert run.unit == "multiples of the known zone" and young[0] < 0.5 < young[1]
+    assert not [name for name in TEXTS if "kPa" in (folder / "multiples" / name).read_text()]
+    model = json.loads((folder / "multiples" / "model.json").read_text())
+    former = IdentifiedBody.from_dict(model | {"units": "mm, kg, s, mN, kPa"})
+    np.testing.assert_array_equal(former.theta, run.body.theta)
+    with pytest.raises(InputError, match="units"):
+        IdentifiedBody.from_dict(model | {"relative": False})
 
 
 def test_a_map_that_no_regions_explain_says_so_first(folder: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,8 +15,9 @@ from naibu.core.volume import Volume
 from naibu.io.images import write_volume
 from naibu.io.meshes import read_mesh
 from naibu.io.vtk_files import write_vtu
-from naibu.meshing import box, signed_volumes
+from naibu.meshing import VolumeCut, box, signed_volumes
 from naibu.workflows import cut
+from naibu.workflows.interactive.cut import joined_text
 
 SIZE = 20.0
 
@@ -70,6 +72,24 @@ def test_friction_does_not_hold_what_opens_and_is_refused_where_there_is_none(tm
     with pytest.raises(InputError, match="the sides of the cut of a lattice do not touch"):
         cut("dough-pressed-by-sphere", path, out=tmp_path / "wrong", lips_friction=0.3)
     assert not list((tmp_path / "wrong").glob("*"))
+
+
+def test_a_second_run_goes_on_from_the_mesh_of_the_first_and_says_so(tmp_path: Path) -> None:
+    for k, (first, last) in enumerate([(-15, 1), (1, 15)]):
+        blade = path_file(tmp_path, 0.0, "\n".join(f"1,{y},-5,1,{y},{SIZE + 5}" for y in (first, last)) + "\n")
+        done = cut(mesh_file(tmp_path) if k == 0 else tmp_path / "0" / "cut.vtu", blade, out=tmp_path / str(k), pull_percent=0.0)
+        numbers = json.loads((tmp_path / str(k) / "cut.json").read_text())
+        assert (len(done.volumes_mm3), numbers["length_of_earlier_cuts_that_it_goes_on_from_mm"] > SIZE - 5.0) == ((1, False), (2, True))[k]
+        assert numbers["places_where_the_sides_hang_together_mm"] == []
+        assert ("It goes on from earlier cuts" in (tmp_path / str(k) / "cut.html").read_text()) == bool(k)
+
+
+def test_where_an_earlier_cut_is_not_met_is_told(tmp_path: Path) -> None:
+    found = cut(mesh_file(tmp_path), path_file(tmp_path, 10.0), out=tmp_path / "out").cut
+    assert joined_text(found) == ""
+    assert isinstance(found, VolumeCut)
+    missed = replace(found, bridges=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]))
+    assert "At 2 places (near 1, 2, 3; 4, 5, 6 mm) an earlier cut ends without meeting this one" in joined_text(missed)
 
 
 LATTICE = """

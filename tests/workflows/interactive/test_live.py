@@ -251,11 +251,16 @@ def pieces(simulation: LiveSimulation) -> int:
     return int(connected_components(graph, directed=False)[0])
 
 
-def outlined(page: Page, picture: Path) -> int:
-    """Number of black pixels of the 3-D view that are a few pixels from white ones: those of the line of a cut, on any colour."""
+def view_of(page: Page, picture: Path) -> np.ndarray:
+    """Return the pixels (h, w, 3) of the 3-D view, which are also written with those of the page to a file."""
     box = page.value("(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); return [b.left, b.top, b.right, b.bottom]; })()")
     left, top, right, bottom = (round(edge) for edge in box)
-    shown = imread(page.picture(picture))[top:bottom, left:right, :3]
+    return np.asarray(imread(page.picture(picture))[top:bottom, left:right, :3])
+
+
+def outlined(page: Page, picture: Path) -> int:
+    """Number of black pixels of the 3-D view that are a few pixels from white ones: those of the line of a cut, on any colour."""
+    shown = view_of(page, picture)
     return int(((shown < 0.02).all(axis=2) & binary_dilation((shown > 0.99).all(axis=2), iterations=3)).sum())
 
 
@@ -272,14 +277,21 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
         left, top, width, height = page.value(
             "(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
         )
+        page.value(
+            "window.told = []; new MutationObserver(() => { const { element, text } = naibuLive.notice;"
+            " if (!element.hidden) told.push(text.textContent); }).observe(naibuLive.notice.element, {attributes: true, subtree: true})"
+        )
         path = [(left + width * 0.5, top + height * (0.08 + 0.03 * k)) for k in range(16)]
         page.mouse("mousePressed", *path[0])
         for at in path[1:]:
             page.mouse("mouseMoved", *at)
         page.mouse("mouseReleased", *path[-1])
+        page.wait("told.length > 0", 30)
+        assert page.value("told[0]") == "Cutting…"
         page.wait("naibuLive.scene.topology === 1 && naibuLive.frame.topology === 1", 60)
         assert page.value("naibuLive.scene.points.length") > 3 * 125
         assert simulation.scene.topology == 1
+        page.wait("naibuLive.notice.element.hidden && naibuLive.conflicting.every((control) => !control.disabled)", 30)
         assert page.value("naibuLive.scene.outline.length") > 0  # the cut is closed: its outline shows where it is
         page.wait("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
         for dark in (False, True):
@@ -324,11 +336,60 @@ def test_markers_are_seen_in_a_section_and_the_tool_that_waits_is_seen_whole(tmp
         for clip in ("null", "1, 0.5", "1, 0.02"):
             page.value(f"naibuLive.view.setClip({clip}); naibuLive.view.renderFinest()")
             page.wait("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
-            shown = imread(page.picture(tmp_path / "section.png"))[..., :3]
+            shown = view_of(page, tmp_path / "section.png")
             seen.append(int(((shown[..., 0] > 0.6) & (shown[..., 1] < 0.5) & (shown[..., 2] < 0.2)).sum()))
         assert seen[0] == 0  # within an opaque body
         assert seen[1] > 30
         assert seen[2] == 0  # none lies so near to the side of the cube
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_what_conflicts_with_a_cut_under_way_waits_and_long_steps_are_told(tmp_path: Path) -> None:
+    with served() as (address, simulation), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value("naibuLive.notice.ask()")
+        page.wait("naibuLive.conflicting.length === 5 && naibuLive.conflicting.every((control) => control.disabled)", 30)
+        page.value("naibuLive.take(''); naibuLive.command('undo')")
+        assert "wait until it opens" in page.value("naibuLive.message.textContent")
+        page.picture(tmp_path / "cutting.png")
+        page.value("naibuLive.notice.forget()")
+        page.wait("naibuLive.conflicting.every((control) => !control.disabled)", 30)
+        assert simulation.frame().tool == 0
+        seen = page.value(
+            "(() => { const n = naibuLive.notice; const told = [];"
+            " for (const [cutStage, underWay, at] of [[1, false, 0], [-1, true, 100], [-1, true, 900], [-1, false, 950]]) {"
+            " n.follow({ cutStage, underWay }, at); told.push([n.element.hidden, n.cutting, n.text.textContent, n.bar.value]); }"
+            " return told; })()"
+        )
+        assert [s[:2] for s in seen] == [[False, True], [True, False], [False, False], [True, False]]
+        assert "volume strains" in seen[0][2] and seen[0][3] == 1.5 and "takes long" in seen[2][2]
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_section_between_two_layers_of_markers_shows_both() -> None:
+    """Layers 32 mm apart, of 9 markers each: half the mean distance of markers in the cube of 40 mm is 7.6 mm."""
+    body = touched_lattice()
+    x, y, z = body.points.T
+    both = np.flatnonzero((np.abs(x - 20.0) < 11.0) & (np.abs(y - 20.0) < 11.0) & (np.abs(z - 20.0) > 19.0))
+    assert len(both) == 18
+    inward = np.ravel_multi_index((2, 2, 2), (5, 5, 5))
+    weights = np.tile([0.8, 0.2], (len(both), 1))  # at z = 4 and 36 mm
+    np.testing.assert_allclose(body.points[inward], 20.0)
+    model = TouchableModel("Cube", (), body, "mean elongation, %", np.stack([both, np.full(len(both), inward)], axis=1), weights)
+    count = (
+        "(() => { const m = naibuLive.view.markers; let n = 0; for (let q = 0; q < m.count; q += 1)"
+        " n += m.instanceMatrix.array[16 * q] > 0; return n; })()"
+    )
+    with served(model) as (address, _), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null", 60)
+        page.value("naibuLive.view.setMarkers(true)")
+        seen = []
+        for clip in ("null", "2, 0.5", "2, 0.85", "2, 1.0"):
+            page.value(f"naibuLive.view.setClip({clip})")
+            seen.append(page.value(count))
+        assert seen == [18, 18, 9, 9]
 
 
 def test_markers_come_back_when_a_cut_is_undone() -> None:

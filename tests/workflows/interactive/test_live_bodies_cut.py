@@ -14,7 +14,8 @@ from naibu.workflows import touchable
 
 
 @pytest.mark.slow
-def test_gels_that_are_cut_right_through_under_their_weight_go_on_with_friction() -> None:
+@pytest.mark.parametrize("prepared", [False, True], ids=["at once", "prepared"])
+def test_gels_that_are_cut_right_through_under_their_weight_go_on_with_friction(prepared: bool) -> None:
     """The whole weight comes to bear on pairs none of which pressed before, for which Newton's method alone finds no balance."""
     body = touchable("demo").body
     assert isinstance(body, FiniteElementBody) and isinstance(body.engine, RealTimeEngine)
@@ -22,7 +23,12 @@ def test_gels_that_are_cut_right_through_under_their_weight_go_on_with_friction(
     frames = [simulation.advance() for _ in range(40)]
     low, high = body.points.min(axis=0), body.points.max(axis=0)
     middle = 0.5 * (low[2] + high[2])
-    simulation.cut([[[x, low[1] - 30.0, middle + 2.0], [x, high[1] + 30.0, middle - 2.0]] for x in (low[0] - 30.0, high[0] + 30.0)])
+    blade = [[[x, low[1] - 30.0, middle + 2.0], [x, high[1] + 30.0, middle - 2.0]] for x in (low[0] - 30.0, high[0] + 30.0)]
+    if prepared:
+        simulation.begin_cut(blade)
+        assert simulation.finish_cut(wait=True)
+    else:
+        simulation.cut(blade)
     frames = [simulation.advance() for _ in range(60)]
     simulation.close()
     assert not any(frame.failed for frame in frames)

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,12 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import worker_tasks
 from virtual_press import COARSE, KNOWN, PLATEN_POSITIONS_MM, TRUTH, Press, stop_at
 
 import naibu
 from naibu.core.arrays import FloatArray
-from naibu.core.errors import ConvergenceError, InputError
+from naibu.core.errors import ConvergenceError, InputError, WorkerLostError
 from naibu.core.experiment import Experiment
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
@@ -220,6 +222,28 @@ def test_experiments_are_predicted_from_each_other(press: Press, experiment_fold
         np.testing.assert_allclose(row.prediction.residual, here[row.experiment, row.state].prediction.residual, atol=1e-9)
     with pytest.raises(InputError, match="cross_validate"):
         identify.identify(press.folder, workers=2)
+
+
+def test_a_worker_that_is_killed_costs_its_fold_only(press: Press, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calibration, fold = press.identification.calibration, cross_validation.predicted_from_others
+    mine = calibration.load_cases[0].specimen.experiment
+    mine = replace(mine, states=mine.states[:2])
+    both, found = [mine, replace(mine, name="sister")], {}
+    for times in (1, 99):  # the worker that takes the fold over computes it, or is killed as well
+        folder, begun = tmp_path / f"kept {times}", tmp_path / f"begun {times}"
+        folder.mkdir()
+        task = partial(worker_tasks.killed_at, fold, ("left_out", "press"), times, str(begun))
+        monkeypatch.setattr(cross_validation, "predicted_from_others", task)
+        found[times], trouble = left_out_in_turn(both, calibration, Workers(2), None, SearchCheckpoint({}, folder=folder))
+        assert begun.read_text() == "xx"
+        assert isinstance(trouble, WorkerLostError) if times > 1 else trouble is None
+        # what was lost is computed when the identification goes on
+        assert set(SearchCheckpoint.read(folder, {}).models) == ({"sister"} if times > 1 else {"press", "sister"})
+    (rescued, undisturbed), (left,) = found[1], found[99]
+    assert [r.experiment for r in (rescued, undisturbed, left)] == ["press", "sister", "sister"]
+    np.testing.assert_array_equal(left.prediction.residual, undisturbed.prediction.residual)
+    # the two experiments hold the same markers, so that each predicts the other as the other does it, but for where the search starts
+    np.testing.assert_allclose(rescued.prediction.residual, undisturbed.prediction.residual, atol=0.01)
 
 
 def test_an_experiment_that_was_predicted_before_an_interruption_is_not_calibrated_again(

@@ -15,6 +15,7 @@ import pytest
 
 from naibu.cli import main
 from naibu.core.errors import InputError, NaibuError
+from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
 from naibu.imaging.measure_displacement import METHODS, matched_rigidly, measure_displacement
 from naibu.io.displacement_fields import read_field
@@ -81,7 +82,7 @@ def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> Non
     vectors, grid = read_displacement(tmp_path / "displacement.mha")
     assert grid.same_grid(pair.reference)
     assert np.allclose(vectors, run.measured.displacement.vectors, atol=1e-5, equal_nan=True)
-    assert read_mesh(tmp_path / "displacement.vtu").n_cells > 1000
+    assert_one_hexahedron_between_eight_voxels(read_mesh(tmp_path / "displacement.vtu"), run.measured.displacement.valid, grid)
     field = read_field(tmp_path / "field.h5")
     assert len(field.points) > 500 and field.covariance is not None  # blocks of voxels
     before, after = (import_markers(tmp_path / f"{name}.csv") for name in ("initial", "pressed"))
@@ -94,6 +95,16 @@ def test_files_are_what_other_programs_read(folder: Path, tmp_path: Path) -> Non
     page = (tmp_path / "report.html").read_text()
     assert "standard deviation of the displacement" in page
     assert not re.search(r"(?:src|href)=\"https?:", page)
+
+
+def assert_one_hexahedron_between_eight_voxels(mesh: Mesh, known: Array, grid: Volume) -> None:
+    """Cells are those of the grid, and there is one wherever the displacement is known at all corners; of voxels (nz, ny, nx)."""
+    corners = grid.to_index(mesh.points)[mesh.cells]
+    np.testing.assert_allclose(np.ptp(corners, axis=1), 1.0, atol=1e-4)
+    lowest = np.rint(corners.min(axis=1)).astype(int)[:, ::-1]
+    assert (np.abs(np.sort(corners - lowest[:, None, ::-1], axis=1) - np.repeat([[0.0], [1.0]], 4, axis=0)) < 1e-4).all()
+    full = np.all([np.roll(known, (-z, -y, -x), (0, 1, 2)) for z in (0, 1) for y in (0, 1) for x in (0, 1)], axis=0)
+    assert np.array_equal(lowest[np.lexsort(lowest.T[::-1])], np.argwhere(full))
 
 
 def test_the_same_scans_give_the_same_files(folder: Path, tmp_path: Path) -> None:

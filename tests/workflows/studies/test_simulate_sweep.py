@@ -2,10 +2,12 @@
 
 import csv
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+import worker_tasks
 from lattice_studies import STUDY, study_file
 
 from naibu.core.errors import InputError
@@ -13,7 +15,8 @@ from naibu.core.progress import ProgressReport
 from naibu.io.study_schemas.sweep_schema import SweepFile, load_sweep
 from naibu.workflows.studies.simulate import simulate
 from naibu.workflows.studies.simulate_lattice import simulate_lattice
-from naibu.workflows.studies.sweeps.simulate_sweep import sweep_text
+from naibu.workflows.studies.sweeps import simulate_sweep
+from naibu.workflows.studies.sweeps.simulate_sweep import prepared_sweep, sweep_text
 from naibu.workflows.studies.sweeps.sweep_design import design
 
 SWEEP = """
@@ -96,6 +99,20 @@ def test_a_run_that_cannot_be_computed_is_a_row_that_says_why(tmp_path: Path) ->
     rows = json.loads((tmp_path / "out" / "varied.json").read_text(encoding="utf-8"))["rows"]
     assert [bool(row["problem"]) for row in rows] == [False, True, False, True]
     assert "centre_mm" in rows[1]["problem"] and rows[1]["figures"]["largest displacement, mm"] is None
+
+
+@pytest.mark.parametrize("times", [1, 99])
+def test_a_worker_that_is_killed_costs_its_run_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, times: int) -> None:
+    source, run = sweep_file(tmp_path), simulate_sweep.run_of_sweep
+    victim = ("document", prepared_sweep(source).documents[1])
+    simulate(source, out=tmp_path / "whole")
+    monkeypatch.setattr(simulate_sweep, "run_of_sweep", partial(worker_tasks.killed_at, run, victim, times, str(tmp_path / "begun")))
+    assert simulate(source, out=tmp_path / "killed", workers=2).finished
+    assert (tmp_path / "begun").read_text() == "xx"
+    whole, killed = (json.loads((tmp_path / name / "varied.json").read_text(encoding="utf-8"))["rows"] for name in ("whole", "killed"))
+    lost = times > 1
+    assert [row for k, row in enumerate(killed) if k != 1 or not lost] == [row for k, row in enumerate(whole) if k != 1 or not lost]
+    assert ("run 2: its worker died twice (killed by SIGKILL)" in killed[1]["problem"]) == lost
 
 
 def test_an_interrupted_sweep_keeps_its_runs_and_goes_on(tmp_path: Path) -> None:

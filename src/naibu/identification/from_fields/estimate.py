@@ -21,7 +21,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
-from naibu.identification.from_fields.assumptions import MovedBorder, assumptions, covariance_of, effects
+from naibu.identification.from_fields.assumptions import MovedBorder, assumptions, covariance_of
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
@@ -65,12 +65,12 @@ from naibu.identification.from_fields.regions.border_refinement import (
 from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
 from naibu.identification.from_fields.regularization import Regularization, RegularizationName, ZoneGraph, regularization
 from naibu.identification.from_fields.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
+from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.truncated_newton import truncated_step
-from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report, resolution, resolution_report
+from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
 from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, limited_by_elements
 from naibu.identification.load_case import require_load_cases
-from naibu.identification.verdict import Explanation
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
@@ -188,7 +188,7 @@ class _Recipe:
         found = search(homogeneous, first, objective, SearchSettings(tolerance=1e-3))
         young, poisson = young_and_poisson(found.point.theta)
         self.record(
-            f"homogeneous start: Young's modulus {young[0]:.4g} kPa, Poisson's ratio {poisson[0]:.3f}, "
+            f"homogeneous start: Young's modulus {young[0]:.4g}{zones.unit}, Poisson's ratio {poisson[0]:.3f}, "
             f"misfit {found.point.misfit:.4g} (noise alone: {self.model.n_free:.4g})"
         )
         theta = np.repeat(found.point.theta, zones.count)
@@ -390,11 +390,8 @@ class _Recipe:
             by_elements = replace(of_noise, covariance=covariance * np.outer(stretch, stretch)).of_young_and_poisson(theta)[0]
             judged = limited_by_elements(judged, model.zones.names, by_elements, intervals(theta, total)[0])
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
-        fine = judged.explanation is Explanation.EXPLAINED and not coarse
-        how_well = report(model.zones, theta, total, budget=budget, usable=judged.ok, sure=fine, unit=model.zones.unit)
-        words = (judged.sentence, *judged.notes, *how_well, *effects(others, model.zones, theta, intervals(theta, total)[0]))
-        if coarse:
-            words = (words[0], TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1]), *words[1:])
+        limits = (TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1])) if coarse else ()
+        words = statement(judged, model.zones, theta, total, others, limits=limits, budget=budget)
         states = tuple(u[: model.mesh.n_points] for u in point.states)
         return FieldEstimate(
             model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,

@@ -18,7 +18,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import LawName, computed_mesh, field_law
-from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium
+from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, settled
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of
@@ -191,6 +191,6 @@ def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...], modul
         guess = np.asarray(between @ u)
         nodes = guess[: finer.mesh.n_points].ravel()
         guess.ravel()[on.loaded] = on.basis @ nodes[on.unknown]
-        state, _ = equilibrium(body, solvers, lame, shear, on.load_case, guess, b"")
+        state = settled(body, solvers, computed.points, lame, shear, on.load_case, guess)
         out.append(on.residual(state) - o.residual(u))
     return out

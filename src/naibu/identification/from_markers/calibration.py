@@ -9,7 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
-from naibu.core.experiment import Experiment, Layer, State
+from naibu.core.experiment import Experiment, Layer
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.progress import Progress
 from naibu.core.status import Status
@@ -19,6 +19,7 @@ from naibu.identification.from_markers.initial_guess import equilibrium_gap
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.mesh_error import MeshError, mesh_error
 from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel, SolvedLoadCase
+from naibu.identification.from_markers.specimen.indenter_path import state_parameters
 from naibu.identification.from_markers.specimen.parameter_names import (
     SHAPE_NAMES,
     base_offset,
@@ -26,7 +27,6 @@ from naibu.identification.from_markers.specimen.parameter_names import (
     friction,
     joint_friction,
     pixel_scale,
-    platen_position,
     poisson_ratio,
     shape_parameter,
     straight_base,
@@ -265,18 +265,4 @@ def _friction_parameters(s: Specimen) -> list[Parameter]:
             out.append(Parameter(friction(*pair), value, unit, "log", prior_sd=1.0, fixed=pair in loose))
     if model.joined == "sliding":
         out += [Parameter(joint_friction(experiment, h), 0.5, "", "log", prior_sd=1.0) for h in experiment.joined_at_mm]
-    return out
-
-
-def state_parameters(experiment: Experiment, state: State) -> list[Parameter]:
-    """Parameters of the boundary conditions of one state, with their priors: platen position, tilt of a plate, offset of a bar."""
-    prefix = f"{experiment.name}/{state.name}"
-    full = experiment.full_platen_position_mm
-    start = state.estimated_mm or state.stated_mm or 0.7 * full
-    out = [Parameter(platen_position(experiment, state.name), float(start), "mm", prior_sd=5.0)]
-    if experiment.loading.kind != "side_plates":
-        out += [Parameter(f"{prefix}: tilt_{axis}", 0.0, "rad", prior_sd=0.01) for axis in "xy"]
-    if experiment.loading.kind == "bar":
-        out.append(Parameter(f"{prefix}: bar_offset", 0.0, "mm", prior_sd=1.0))
-        out.append(Parameter(f"{prefix}: bar_yaw", 0.0, "rad", prior_sd=0.02))
     return out

@@ -14,7 +14,7 @@ from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 
-UNKNOWN_SD = {"tilt_x": 0.007, "tilt_y": 0.007, "bar_offset": 0.5, "bar_yaw": 0.01, "base_offset": 0.5, "friction": 0.5}
+UNKNOWN_SD = {"tilt": 0.007, "tilt_x": 0.007, "tilt_y": 0.007, "bar_offset": 0.5, "bar_yaw": 0.01, "base_offset": 0.5, "friction": 0.5}
 # of ln(stiffness) of a batch relative to another: samples of the gels of Hirai et al. (2008), Table 3.4, have a pooled SD of 0.22 with 4
 # degrees of freedom; the difference of two has sqrt(2) times that, and 95 % of Student's t lie within 2.78 rather than 1.96 of it
 BATCH_SD = 0.44
@@ -73,7 +73,8 @@ def _relative(p: Parameter, model: CalibratedModel, experiment: Experiment, note
         sisters = similar
         notes.append(f"{kind.replace('_', ' ')} mm is that of {_subjects(similar)}, whose layers have the same nominal height")
     if sisters and kind not in ("height", "width"):
-        return Parameter(p.name, float(np.mean([q.value for q in sisters])), p.unit, p.scale, prior_sd=UNKNOWN_SD.get(kind, p.prior_sd))
+        here, there = UNKNOWN_SD.get(kind, p.prior_sd), float(np.mean([model.standard_deviation(q.name) for q in sisters]))
+        return Parameter(p.name, float(np.mean([q.value for q in sisters])), p.unit, p.scale, prior_sd=float(np.hypot(here, there)))
     return Parameter(p.name, p.value, p.unit, p.scale, prior_sd=UNKNOWN_SD.get(kind, p.prior_sd))
 
 

@@ -25,6 +25,8 @@ from naibu.imaging.large_volumes.block_frame import Block, BlockFrame, blocks_of
 from naibu.imaging.large_volumes.block_sums import ComparedBlock, Stage, compared_block
 from naibu.imaging.large_volumes.summed_equations import Model, SummedEquations
 from naibu.imaging.large_volumes.thinning import COARSE_VOXELS, SMOOTHING, thinned, thinning_factor
+from naibu.imaging.preprocessing.field_of_view import fields_of_view
+from naibu.imaging.preprocessing.volume_pair import require_known
 from naibu.imaging.volume_correlation.correlate import DEFAULT, Correlation
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
@@ -139,8 +141,9 @@ def correlate_blocks(
     """
     if edge < 1 or (factor is not None and factor < 1):
         raise InputError(f"edge and factor must be 1 or more voxels, not {edge} and {factor}")
-    if different := reference.grid.grid_difference(deformed.grid):
-        raise InputError(f"reference and deformed lie on different grids: {different}; resample deformed to the grid of reference first")
+    for name, other in (("deformed", deformed), ("mask", mask), ("deformed_mask", deformed_mask)):
+        if other is not None and (different := reference.grid.grid_difference(other.grid)):
+            raise InputError(f"reference and {name} lie on different grids: {different}; resample {name} to the grid of reference first")
     run = runner or InProcess(reference, deformed, mask)
 
     def start() -> tuple[Correlation, int]:
@@ -222,6 +225,8 @@ def _correlation(
     progress: Progress | None,
 ) -> Correlation:
     small = [thinned(v, factor) for v in volumes]
+    for name, volume, view in zip(("reference", "deformed"), small, fields_of_view(small[0], small[1]), strict=True):
+        require_known(volume, view, name, factor)
     shown: list[ArrayLike | None] = [None if m is None else thinned(m, factor, filled=True).values > TOUCHED for m in masks]
     kind = Correlation if factor == 1 else _ThinnedCorrelation
     return kind(small[0], small[1], (shown[0], shown[1]), settings, progress)

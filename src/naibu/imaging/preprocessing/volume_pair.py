@@ -7,6 +7,7 @@ import numpy as np
 from naibu.core.arrays import AnyArray, AnyFloatArray, Float32Array, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
+from naibu.imaging.preprocessing.field_of_view import Box
 
 
 def intensity_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Float32Array]:
@@ -39,11 +40,59 @@ def intensity_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, F
         raise InputError("reference and deformed do not overlap: no voxel is known in both; check the transform that registered them")
     shift = float(np.mean(reference.values, dtype=np.float64, where=known))
     a, b = shifted_intensity(reference.values, shift, "reference"), shifted_intensity(deformed.values, shift, "deformed")
-    for values, name in ((a, "reference"), (b, "deformed")):
-        low, high = float(np.nanmin(values)), float(np.nanmax(values))
-        if low == high:
-            raise InputError(f"the {name} volume is constant (every voxel is {low + shift:g}): there is nothing to match")
+    for values, volume, name in ((a, reference, "reference"), (b, deformed, "deformed")):
+        if np.nanmin(values) == np.nanmax(values):
+            require_contrast(volume, name)
+            raise InputError(
+                f"the intensities of the reference and the deformed volume lie too far apart: less {shift:.3g}, the mean of the reference, "
+                f"the {name} volume has no contrast left; repair damaged voxels"
+            )
     return a, b
+
+
+def require_contrast(volume: Volume, name: str) -> None:
+    """Refuse a volume of one intensity, or without a voxel that is known.
+
+    Raises
+    ------
+    InputError
+        Such a volume.
+    """
+    values = np.asarray(volume.values)
+    if values.dtype.kind == "f" and np.isnan(values).all():
+        raise InputError(f"the {name} volume shows nothing: every voxel is NaN")
+    low, high = float(np.fmin.reduce(values, axis=None)), float(np.fmax.reduce(values, axis=None))
+    if low == high:
+        raise InputError(f"the {name} volume is constant (every voxel is {low:g}): there is nothing to match")
+
+
+def require_known(volume: Volume, view: Box, name: str, every: int = 1) -> None:
+    """Refuse a volume that shows nothing, or whose field of view has holes.
+
+    Parameters
+    ----------
+    volume : Volume
+        NaN where it was not measured.
+    view : tuple of slice
+        Its field of view (see `naibu.imaging.preprocessing.field_of_view`).
+    name : str
+        What messages call it.
+    every : int
+        Voxels along an edge of those whose means are given.
+
+    Raises
+    ------
+    InputError
+        No voxel that is known, one intensity, or voxels of the field of view that are NaN.
+    """
+    require_contrast(volume, name)
+    values = np.asarray(volume.values)
+    if values.dtype.kind == "f" and (holes := np.isnan(values[view])).any():
+        bad = tuple(int(i + (s.start or 0)) * every for i, s in zip(np.argwhere(holes)[0], view, strict=True))
+        which = "voxel" if every == 1 else "a voxel near"
+        raise InputError(
+            f"{which} {bad} (z, y, x) of the {name} volume is NaN; crop the volumes, or fill unknown voxels with the intensity of air"
+        )
 
 
 def shifted_intensity(values: AnyArray, shift: float, name: str) -> Float32Array:

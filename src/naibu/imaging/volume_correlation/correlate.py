@@ -27,7 +27,7 @@ from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.field_of_view import Box, fields_of_view, in_box
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.resampling import require_mask
-from naibu.imaging.preprocessing.volume_pair import intensity_pair
+from naibu.imaging.preprocessing.volume_pair import intensity_pair, require_known
 from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit, Iterations, cell_kinds, chosen_weights
 from naibu.imaging.volume_correlation.image_level import ImageLevel
@@ -385,7 +385,7 @@ def _check_shape(reference: Volume, deformed: Volume) -> None:
         if min(volume.shape) < LEAST_SIZE:
             raise InputError(
                 f"the {name} volume has {' x '.join(map(str, volume.shape[::-1]))} voxels; volume correlation needs {LEAST_SIZE} or more "
-                "along every axis. For an image or a few slices use naibu.imaging.lucas_kanade"
+                "along every axis. For an image or a few slices use naibu.imaging.lucas_kanade (method='lucas-kanade')"
             )
 
 
@@ -397,13 +397,9 @@ def _filled_pair(reference: Volume, deformed: Volume, views: tuple[Box, Box]) ->
 
 
 def _filled(name: str, volume: Volume, view: Box) -> Volume:
+    require_known(volume, view, name)
     values = np.asarray(volume.values, dtype=np.float32)
     inside = values[view]
-    if np.isnan(inside).any():
-        bad = tuple(int(i + (s.start or 0)) for i, s in zip(np.argwhere(np.isnan(inside))[0], view, strict=True))
-        raise InputError(
-            f"voxel {bad} (z, y, x) of the {name} volume is NaN; crop the volumes, or fill unknown voxels with the intensity of air"
-        )
     if inside.shape != values.shape:
         values = np.where(in_box(view, values.shape), values, inside.mean(dtype=np.float64).astype(np.float32))
     return volume.with_values(values)

@@ -138,8 +138,11 @@ class IntensityComparison:
 
     def anchor(self, first: Float32Array, fraction: float) -> None:
         """Add springs to displacements `first` (n, 3), mm, of a fraction of the mean stiffness that the intensities give."""
+        seen = self.seen
+        if not seen.any():  # nothing pulls
+            return
         diagonal = self.products[:, [0, 3, 5]]
-        strength = np.float32(fraction * diagonal[self.seen].sum(axis=1).mean() / 3)
+        strength = np.float32(fraction * diagonal[seen].sum(axis=1).mean() / 3)
         for k in (0, 3, 5):
             self.products[:, k] += strength
         self.force -= strength * (self.displacement - first)

@@ -214,6 +214,20 @@ class SplineSystem:
         np.add.at(loads, self.slot[at], each)
         return loads.astype(np.float32)
 
+    def dilatation_load(self, c: FloatArray, dilatation: FloatArray) -> Float32Array:
+        """Return the loads (n, 3) of the dilatation penalty of weights (m,) at coefficients c."""
+        z, y, x = self.cells[:, 2:].T
+        a = np.arange(64)
+        at = z[:, None] + (a >> 4), y[:, None] + ((a >> 2) & 3), x[:, None] + (a & 3)
+        gradients = self.gauss.astype(float)
+        deformation = np.eye(3) + np.einsum("qka,mai->mqik", gradients, c[at], optimize=True)
+        determinant = np.linalg.det(deformation)
+        cofactor = determinant[..., None, None] * np.swapaxes(np.linalg.inv(deformation), -1, -2)
+        pressure = -dilatation[:, None] * (determinant - self.ratio)
+        loads = np.zeros((self.n, 3))
+        np.add.at(loads, self.slot[at], np.einsum("mq,mqik,qka->mai", pressure, cofactor, gradients, optimize=True))
+        return loads.astype(np.float32)
+
     def force_loads(self, forces: Float32Array, number: Int32Array | None = None) -> Float32Array:
         """Return loads (n, 3, s) of forces (voxels, 3, s) on the voxels, or on those that are numbered in their box, others being -1."""
         loads = np.zeros((self.n, 3, forces.shape[2]), np.float32)

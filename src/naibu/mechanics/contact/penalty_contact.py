@@ -78,6 +78,10 @@ class Contact:
         """Return the body's orientation (3, 3) at the fraction `load` of the path."""
         return self.rotation if self.tilt is None else rotation_matrix(load * self.tilt) @ self.rotation
 
+    def position(self, load: float) -> FloatArray:
+        """Return the position (3,) of the body's reference point at the fraction `load` of the path, mm."""
+        return np.asarray(self.start + load * (self.stop - self.start))
+
     def with_path(self, start: FloatArray, stop: FloatArray) -> Contact:
         """Return the contact with another path of the body."""
         return replace(self, start=np.asarray(start, dtype=float), stop=np.asarray(stop, dtype=float))
@@ -88,7 +92,7 @@ class Contact:
 
     def local(self, displacement: FloatArray, load: float) -> FloatArray:
         """Return positions (p, 3) of the points in the body's frame, at the fraction `load` of the path."""
-        return np.asarray((self.positions(displacement) - (self.start + load * (self.stop - self.start))) @ self.orientation(load))
+        return np.asarray((self.positions(displacement) - self.position(load)) @ self.orientation(load))
 
     def gap(self, displacement: FloatArray, load: float) -> FloatArray:
         """Return the distances (p,) of the points from the body, mm, negative inside."""

@@ -158,7 +158,7 @@ def add_contact_forces(contact: Contact, anchors: FloatArray, displacement: Floa
     c, gap = contact, np.empty(len(contact.nodes))
     add_forces(
         packed_geometry(c.surface), c.surface.axes, c.nodes, c.shape, c.rest, c.area, c.normal_stiffness, c.tangential_stiffness,
-        c.friction_coefficient, c.tied, displacement, c.start + load * (c.stop - c.start), c.orientation(load), anchors, gap, force,
+        c.friction_coefficient, c.tied, displacement, c.position(load), c.orientation(load), anchors, gap, force,
     )  # fmt: skip
     return gap
 
@@ -180,6 +180,6 @@ def local_positions(contact: Contact, displacement: FloatArray, load: float) -> 
     y, gap = np.empty((len(contact.nodes), 3)), np.empty(len(contact.nodes))
     local(
         packed_geometry(contact.surface), contact.surface.axes, contact.nodes, contact.shape, contact.rest, displacement,
-        contact.start + load * (contact.stop - contact.start), contact.orientation(load), y, gap,
+        contact.position(load), contact.orientation(load), y, gap,
     )  # fmt: skip
     return y, gap

@@ -10,7 +10,7 @@ level and tag, so that it can be refined and coarsened further; bisections that 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,6 +19,7 @@ from naibu.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, require
 from naibu.core.errors import InputError
 from naibu.meshing.cutting import _separation_kernels as kernels
 from naibu.meshing.cutting._crossing_kernels import distances
+from naibu.meshing.cutting.earlier_fronts import bridges, fronts_near
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.quality import smallest_dihedral_angle
 from naibu.meshing.refinement._forest_kernels import COUNT, FLIPPED, LEAF, NODES
@@ -48,9 +49,13 @@ class ForestCut:
         New surface: cell above the blade, place in it of the vertex opposite to the face, and the same of the cell below. Faces at the
         front that other cells still hold together are part of that of the cut that opens them; see `BisectionForest.cut_front`.
     deviation_mm : float
-        Largest distance of a vertex of the new surface from the blade.
+        Largest distance of a vertex of the new surface from the blade, or from the straight way to it from an earlier cut.
     smallest_angle_deg : float
         Smallest dihedral angle of the cells that are new; of all cells, where none is.
+    joined_mm : float
+        Length of the fronts of earlier cuts from which the cut goes on, or into which it runs; 0 where `earlier` was given.
+    bridges : ndarray, shape (b,), int64
+        Vertices at the fronts of earlier cuts near which the body still hangs together between them and this cut.
     """
 
     changes: tuple[MeshChange, ...]
@@ -58,6 +63,8 @@ class ForestCut:
     faces: IntArray
     deviation_mm: float
     smallest_angle_deg: float
+    joined_mm: float
+    bridges: IntArray
 
     def nodal(self, forest: BisectionForest, values: FloatArray) -> FloatArray:
         """Return nodal values (rows, ...) from those before the cut, by numbers in the forest; new nodes have the mean of their edge."""
@@ -100,7 +107,8 @@ def cut_forest(
         are bisected.
     earlier : SweptBlade, optional
         Of a blade that goes on step by step, what it swept in the steps before, as far back as a cell reaches. Cells that were bisected
-        since the last cut, or are now, are separated along it too; without it, parts of them would hold the two sides together.
+        since the last cut, or are now, are separated along it too; without it, the cut goes on straight from the fronts of earlier cuts
+        that it meets.
 
     Raises
     ------
@@ -111,8 +119,11 @@ def cut_forest(
     where = forest.points.copy() if positions is None else np.array(positions, dtype=float)
     _require_cuttable(forest, where, distance_mm)
     before = forest.copied()
+    fronts = fronts_near(forest, blade, where) if earlier is None else None
+    on = blade if fronts is None or fronts.way is None else blade + fronts.way
     try:
-        return _cut(forest, blade, blade if earlier is None else blade + earlier, distance_mm, where, least_angle_deg)
+        found = _cut(forest, on, on if earlier is None else on + earlier, distance_mm, where, least_angle_deg)
+        return found if fronts is None else replace(found, joined_mm=fronts.joined_mm, bridges=bridges(forest, fronts))
     except BaseException:
         forest.become(before)
         raise
@@ -154,7 +165,7 @@ def _cut(
     now = faces[~np.isin(faces[:, 0] * 4 + faces[:, 1], late[:, 0] * 4 + late[:, 1])]
     where, gap = (_extended(values, forest.node_rows, copies) for values in (where, gap))
     _, deviation = kernels.too_coarse(forest.arrays[0], now, where, surface, np.inf, gap, np.empty(0, dtype=np.int64))
-    return ForestCut(tuple(changes), copies, faces, float(deviation), angle)
+    return ForestCut(tuple(changes), copies, faces, float(deviation), angle, 0.0, np.empty(0, dtype=np.int64))
 
 
 def _extended(values: AnyArray, rows: int, copies: IntArray) -> AnyArray:

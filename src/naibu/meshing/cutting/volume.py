@@ -44,11 +44,16 @@ class VolumeCut:
     piece : ndarray, shape (m,), int64
         Piece that each cell belongs to, the one of the largest volume first.
     deviation_mm : float
-        Largest distance of a node of the new surface from the blade.
+        Largest distance of a node of the new surface from the blade, or from the straight way to it from an earlier cut.
     smallest_angle_deg : float
         Smallest dihedral angle of the cells that are new; of all cells, where none is.
     forest : BisectionForest
         Whose leaves are the cells, for the next cut of this mesh.
+    joined_mm : float
+        Length of the fronts of earlier cuts from which the cut goes on, or into which it runs; 0 where `earlier` was given.
+    bridges : ndarray, shape (b, 3)
+        Places in the reference configuration, mm, at the fronts of earlier cuts near which the body still hangs together between them and
+        this cut.
     """
 
     mesh: Mesh
@@ -61,6 +66,8 @@ class VolumeCut:
     deviation_mm: float
     smallest_angle_deg: float
     forest: BisectionForest
+    joined_mm: float
+    bridges: FloatArray
 
     @property
     def n_pieces(self) -> int:
@@ -113,7 +120,8 @@ def cut_volume(
         goes on step by step, and the quality of all cells is that of one bisection of the first mesh.
     earlier : SweptBlade, optional
         Of a blade that goes on step by step, what it swept in the steps before, as far back as a cell reaches. Cells that are bisected now
-        are separated along it too; without it, parts of them would hold the two sides together.
+        are separated along it too. Without it, the fronts of earlier cuts are found in the mesh: from those within 0.75 of the longest edge
+        around them the cut goes on straight to the blade, if they end near its rim or would run into it.
 
     Raises
     ------
@@ -151,6 +159,7 @@ def _described(mesh: Mesh, forest: BisectionForest, found: ForestCut, before: In
         ends=forest.node_parents[mesh.n_points : refined].astype(np.int64),
         source=np.concatenate([np.arange(refined), found.copies[:, 0]]).astype(np.int64), faces=faces, piece=forest_pieces(forest),
         deviation_mm=found.deviation_mm, smallest_angle_deg=found.smallest_angle_deg, forest=forest,
+        joined_mm=found.joined_mm, bridges=forest.points[found.bridges],
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer, Loading, Shape, State
 from naibu.core.markers import Markers
 from naibu.core.rigid_transform import RigidTransform, rotation_matrix
-from naibu.identification.from_markers.calibration import state_parameters
+from naibu.identification.from_markers.specimen.indenter_path import state_parameters
 from naibu.identification.from_markers.specimen.parameter_names import friction, poisson_ratio, young_modulus
 from naibu.identification.from_markers.specimen.resting_state import since_scan
 from naibu.identification.from_markers.specimen.scan_alignment import placement

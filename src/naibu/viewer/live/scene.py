@@ -13,7 +13,7 @@ from naibu.viewer.live.closed_surface import is_closed
 from naibu.viewer.live.cut_outline import cut_outline
 from naibu.viewer.motion_page import RigidShape
 
-MAGIC = b"NLV3"
+MAGIC = b"NLV4"
 HEADER = np.dtype(
     [
         ("magic", "S4"),
@@ -34,9 +34,10 @@ HEADER = np.dtype(
         ("unbalanced", "<f4"),
         ("rotation", "<f4", 4),
         ("readings", "<u4"),
+        ("cut_stage", "<i4"),
     ]
 )
-PAUSED, DRIVING, RECORDING, REPLAYING, FAILED, HELD = 1, 2, 4, 8, 16, 32
+PAUSED, DRIVING, RECORDING, REPLAYING, FAILED, HELD, UNDER_WAY = 1, 2, 4, 8, 16, 32, 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +99,8 @@ class LiveScene:
         Whether the body can be cut.
     readings : sequence of LiveReading
         What frames carry, in that order.
+    cut_stages : sequence of str
+        What is computed before a cut opens, in the order in which frames number it.
     """
 
     title: str
@@ -115,6 +118,7 @@ class LiveScene:
     topology: int = 0
     cuttable: bool = False
     readings: Sequence[LiveReading] = ()
+    cut_stages: Sequence[str] = ()
 
     def payload(self) -> dict[str, object]:
         """Return the scene for JSON; ``viewer-src/src/live-decode.js`` is the inverse."""
@@ -138,6 +142,7 @@ class LiveScene:
             "topology": self.topology,
             "cuttable": self.cuttable,
             "readings": [asdict(reading) for reading in self.readings],
+            "cut_stages": list(self.cut_stages),
         }
 
 
@@ -162,7 +167,7 @@ class LiveFrame:
     penetration_mm, steps_per_s, real_time : float
         How deep the surface lies in the tool; steps a second; simulated seconds a second.
     flags : int
-        Sum of `PAUSED`, `RECORDING`, `REPLAYING`, `FAILED`, `HELD` (the tool is held back).
+        Sum of `PAUSED`, `RECORDING`, `REPLAYING`, `FAILED`, `HELD` (the tool is held back), `UNDER_WAY` (a step takes longer than a frame).
     strain : callable
         Returns the strain at the nodes (n,), computed when it is asked for.
     topology : int
@@ -171,6 +176,8 @@ class LiveFrame:
         Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
     rotation : tuple of float
         Of the tool since it was made, as a quaternion, scalar last.
+    cut_stage : int
+        Number in the scene's stages of what is being computed for a cut; -1 where none is under way.
     readings : ndarray, shape (k, 3)
         Value and both ends of the 95 % interval of every reading of the scene; NaN where there is none.
     """
@@ -191,6 +198,7 @@ class LiveFrame:
     topology: int = 0
     unbalanced: float = 0.0
     rotation: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    cut_stage: int = -1
     readings: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
@@ -203,7 +211,7 @@ def frame_bytes(frame: LiveFrame, driving: bool, values: FloatArray | None = Non
         ("topology", frame.topology), ("time_s", frame.time_s),
         ("force", frame.force), ("pull", frame.pull), ("centre", frame.centre), ("penetration", frame.penetration_mm),
         ("steps_per_s", frame.steps_per_s), ("real_time", frame.real_time), ("unbalanced", frame.unbalanced),
-        ("rotation", frame.rotation), ("readings", len(frame.readings)),
+        ("rotation", frame.rotation), ("readings", len(frame.readings)), ("cut_stage", frame.cut_stage),
     ):  # fmt: skip
         header[name] = value
     parts: list[Float32Array] = [np.asarray(frame.positions, dtype="<f4")]

@@ -45,7 +45,7 @@ def packed_scene(scene: Scene) -> dict[str, object]:
             {
                 "label": s.label,
                 "load_mm": jsonable(s.load_mm),
-                "boxes": [jsonable(np.array([*b.centre_mm, *b.half_size_mm]), 5) for b in s.indenters],
+                "boxes": [jsonable(np.array([*b.centre_mm, *b.half_size_mm, *b.turned]), 5) for b in s.indenters],
             }
             for s in scene.steps
         ],

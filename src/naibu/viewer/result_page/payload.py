@@ -20,10 +20,21 @@ from naibu.viewer.tables import Table
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A plate or bar, drawn as an axis-aligned box: centre and half edge lengths along x, y, z, mm."""
+    """A plate or bar, drawn as a box.
+
+    Attributes
+    ----------
+    centre_mm : tuple of float
+        Its centre.
+    half_size_mm : tuple of float
+        Half edge lengths along x, y, z before it is turned.
+    turned : tuple of float
+        Unit quaternion (x, y, z, w) by which it is turned about its centre.
+    """
 
     centre_mm: tuple[float, float, float]
     half_size_mm: tuple[float, float, float]
+    turned: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -106,9 +106,7 @@ class FieldIdentification(ShownInNotebook):
     @property
     def unit(self) -> str:
         """Unit of Young's modulus."""
-        if not self.relative or self.estimate.zones.known:
-            return "multiples of the known zone" if self.relative else "kPa"
-        return "multiples of the median" if self.estimate.uncertainty is None else "multiples of the largest region"
+        return self.body.unit
 
     def page_html(self) -> str:
         """Return the page of the result, a whole HTML document."""

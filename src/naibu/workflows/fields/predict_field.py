@@ -352,7 +352,6 @@ def _page(run: FieldPredictionRun, field: DisplacementField) -> SliceView:
         said = "" if c.rms_sd is None else f"{c.rms_sd:.2f} standard deviations, at points {c.role}"
         cards.append(Card("Predicted less measured, RMS", f"{rms:.2g} mm", said))
     rows = tuple((name, e, nu) for name, e, nu in run.body.moduli()) if len(run.body.zones) <= 20 else ()
-    unit = "multiples of the known zone" if run.body.relative else "kPa"
     return SliceView(
         title="Predicted displacement",
         sentences=run.notes,
@@ -360,7 +359,7 @@ def _page(run: FieldPredictionRun, field: DisplacementField) -> SliceView:
         images=[("body", np.where(np.isfinite(size), 1.0, 0.0))],
         displacement=np.asarray(field.vectors @ grid.direction),
         overlays=overlays,
-        tables=[Table("Moduli of the model", ("zone", f"Young's modulus, {unit}", "Poisson's ratio"), rows)] if rows else [],
+        tables=[Table("Moduli of the model", ("zone", f"Young's modulus, {run.body.unit}", "Poisson's ratio"), rows)] if rows else [],
         origin_mm=grid.origin_mm @ grid.direction,
         direction=grid.direction,
         cards=cards,

@@ -33,7 +33,7 @@ from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, motion_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Table, quantity_of
-from naibu.workflows.interactive.cut_surface import length_text
+from naibu.workflows.interactive.cut_surface import length_text, places_text
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, touchable
 from naibu.workflows.markers.experiments import Source
 from naibu.workflows.results.output_folder import folder_of_results
@@ -241,7 +241,24 @@ def _numbers(mesh: Mesh, found: VolumeCut | LatticeCut, volumes: FloatArray) -> 
     }
     if isinstance(found, LatticeCut):
         return numbers | {"nodes_before": mesh.n_points, "nodes": len(found.source), "elements": found.lattice.n_elements}
-    return numbers | {"smallest_dihedral_angle_of_new_cells_deg": found.smallest_angle_deg}
+    return numbers | {
+        "smallest_dihedral_angle_of_new_cells_deg": found.smallest_angle_deg,
+        "length_of_earlier_cuts_that_it_goes_on_from_mm": found.joined_mm,
+        "places_where_the_sides_hang_together_mm": found.bridges.tolist(),
+    }
+
+
+def joined_text(found: VolumeCut | LatticeCut) -> str:
+    """Return sentences on earlier cuts that end near the blade, empty where none does."""
+    if isinstance(found, LatticeCut):
+        return ""
+    said = [f"It goes on from earlier cuts, over {found.joined_mm:.3g} mm of their ends."] if found.joined_mm else []
+    if len(found.bridges):
+        said.append(
+            f"At {places_text(found.bridges)} an earlier cut ends without meeting this one, and the body hangs together between them; let "
+            "the blade begin within the earlier cut."
+        )
+    return " ".join(said)
 
 
 def _reach(points: FloatArray) -> str:
@@ -287,6 +304,7 @@ def _page(
         f"The cut leaves {found.n_pieces} {'piece' if found.n_pieces == 1 else 'pieces'} of {sizes} cm³. It deviates from the blade by "
         f"{length_text(found.deviation_mm)} at most and opens by {numbers['largest_opening_mm']:.3g} mm where its ends along "
         f"{numbers['pulled_along']} are pulled apart by {numbers['pull_percent']:g} %.",
+        *([earlier] if (earlier := joined_text(found)) else []),
         model.sentences[0],
         *([f"Its sides rub on each other with a friction coefficient of {friction:g}."] if friction else []),
         *([model.doubt] if model.doubt else []),

@@ -37,7 +37,7 @@ LARGE_POINTS = 30_000  # surfaces of more have fewer frames
 FRAME_S = 0.1
 PAGE_BYTES = 24_000_000
 PAGE_TRIANGLES = 60_000  # those nearest to the cut are shown
-TOLD_BRIDGES = 3
+TOLD_PLACES = 3
 INSIDE = 0.5  # of the distance: tips deeper than this below the surface cut a groove
 
 
@@ -167,12 +167,16 @@ def incomplete_text(found: SurfaceCut, refined: bool) -> str:
     """Return a sentence on what of the path was not cut, empty where nothing of it hangs together."""
     said = [f"No cut was found for {found.missed_mm:.3g} mm of the path."] if found.missed_mm else []
     if len(found.bridges):
-        where = "; ".join(", ".join(f"{v:.4g}" for v in place) for place in found.bridges[:TOLD_BRIDGES])
-        count = "one place" if len(found.bridges) == 1 else f"{len(found.bridges)} places"
         remedy = "a smaller distance" if refined else "refinement"
-        more = ", ..." if len(found.bridges) > TOLD_BRIDGES else ""
-        said.append(f"The cut is not complete: at {count} its two sides still hang together, near {where}{more} mm; {remedy} helps.")
+        said.append(f"The cut is not complete: at {places_text(found.bridges)} its two sides still hang together; {remedy} helps.")
     return " ".join(said)
+
+
+def places_text(places: FloatArray) -> str:
+    """Return how many places (k, 3), mm, there are, and where the first ones are, as text."""
+    count = "one place" if len(places) == 1 else f"{len(places)} places"
+    where = "; ".join(", ".join(f"{v:.4g}" for v in place) for place in places[:TOLD_PLACES])
+    return f"{count} (near {where}{', ...' if len(places) > TOLD_PLACES else ''} mm)"
 
 
 def mean_edge_mm(surface: Surface) -> float:

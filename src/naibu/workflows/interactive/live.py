@@ -16,6 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.simulation.background_cut import CUT_STAGES
 from naibu.simulation.frame import Frame
 from naibu.simulation.haptics.haptic_loop import LONGEST_STEP_S, HapticHand
 from naibu.simulation.haptics.haptic_thread import HapticThread
@@ -25,7 +26,7 @@ from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulati
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.simulation.tool_places import placed
 from naibu.viewer.live.commands import LiveCommand
-from naibu.viewer.live.scene import FAILED, HELD, PAUSED, RECORDING, REPLAYING, LiveFrame, LiveScene
+from naibu.viewer.live.scene import FAILED, HELD, PAUSED, RECORDING, REPLAYING, UNDER_WAY, LiveFrame, LiveScene
 from naibu.viewer.live.server import LiveServer, bound_port, serve
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.workflows.applications.fingertip_study import FINGERTIP, describes_fingertip
@@ -67,7 +68,7 @@ class LiveSimulation:
             np.array([f.centre for f in body.fixtures], dtype=float).reshape(-1, 3),
             self.model.strain, self.loop.simulation.frame_s, self.model.marker_nodes[: None if whole else 0],
             self.model.marker_weights[: None if whole else 0], topology, cuttable=self.model.cuttable,
-            readings=() if self.model.sensor is None else self.model.sensor.readings,
+            readings=() if self.model.sensor is None else self.model.sensor.readings, cut_stages=CUT_STAGES,
         )  # fmt: skip
 
     @property
@@ -79,13 +80,13 @@ class LiveSimulation:
         """Return the last frame."""
         frame, pace = self.loop.latest()
         flags = PAUSED * pace.paused | RECORDING * pace.recording | REPLAYING * pace.replaying | FAILED * bool(frame.failed)
-        flags |= HELD * frame.held
+        flags |= HELD * frame.held | UNDER_WAY * frame.under_way
         tool = list(self.loop.simulation.tools).index(frame.tool) if frame.tool else -1
         return LiveFrame(
             frame.number, frame.time_s, frame.positions, tool, frame.gripped, frame.tool_centre, frame.force, frame.pull,
             frame.penetration_mm, pace.steps_per_s, pace.real_time, flags,
             lambda: frame.body.strain(frame.positions), frame.topology, frame.unbalanced,
-            tuple(Rotation.from_matrix(frame.tool_rotation).as_quat().tolist()),
+            tuple(Rotation.from_matrix(frame.tool_rotation).as_quat().tolist()), pace.cut_stage,
             np.zeros((0, 3)) if self.model.sensor is None else self.model.sensor.at(frame),
         )  # fmt: skip
 

@@ -245,7 +245,7 @@ def _identified_from_fields(path: Path, model: IdentifiedBody) -> TouchableModel
     body = FiniteElementBody.of(model.mesh, law.assembler(*model.lame_of_cells()), supported=_lowest(model.mesh.points))
     zones = [f"{name} {young:.3g}" for name, young, _ in model.moduli()]
     listed = f": {', '.join(zones)}" if len(zones) <= MOST_LISTED else f" of {len(zones)} zones"
-    unit = "multiples of the known zone; forces are in the same measure" if model.relative else "kPa"
+    unit = f"{model.unit}; forces are in the same measure" if model.relative else model.unit
     said = (
         f"Finite elements of the identified moduli, neo-Hookean: {model.mesh.n_cells} cells; Young's modulus{listed} ({unit}).",
         "The nodes of least z are held.",

@@ -153,6 +153,11 @@ class BlockCheckpoint:
         for path in paths:
             yield _loaded(path)
 
+    def forget(self) -> None:
+        """Remove the folder of a measurement that was refused before anything was computed: there is nothing to resume."""
+        if [path.name for path in self.folder.iterdir()] == [_HEAD]:
+            self.remove()
+
     def remove(self) -> None:
         """Remove the folder: the measurement is done."""
         shutil.rmtree(self.folder, ignore_errors=True)

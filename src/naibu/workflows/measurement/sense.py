@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from naibu._version import __version__
-from naibu.core.arrays import BoolArray, FloatArray, require_lengths
+from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.markers import Markers
 from naibu.core.mesh import Mesh
@@ -275,6 +275,8 @@ def sense_pair(
 
 def recorded(pair: Pair, measured: MeasuredDisplacement, seconds: float, folder: Path | None) -> SenseRun:
     """Return a measured displacement with its figures, and write it where a folder is given (see `sense_pair`)."""
+    if not (measured.mask & measured.displacement.valid).any():
+        raise InputError("the displacement was found nowhere in the object: check that both scans show the same object")
     run = SenseRun(measured, seconds, figures(pair, measured), pair)
     return run if folder is None else replace(run, files=written_together(folder, FILES, lambda at: _written(pair, run, at)))
 
@@ -304,6 +306,8 @@ def figures(pair: Pair, measured: MeasuredDisplacement) -> dict[str, float | int
 
 def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
     measured, grid = run.measured, pair.reference
+    # what cannot be written is refused before the first file; between the voxels of a single slice there are no cells
+    cells = _cells(measured, grid) if min(grid.shape) > 1 else None
     files = [
         write_atomically(folder / "report.html", slices_html(slice_view(pair, run))),
         write_displacement(folder / "displacement.mha", measured.displacement.vectors, grid),
@@ -311,8 +315,8 @@ def _written(pair: Pair, run: SenseRun, folder: Path) -> list[Path]:
     sd = measured.displacement.largest_sd_mm
     if sd is not None:
         files.append(write_volume(folder / "standard_deviation.mha", grid.with_values(np.nan_to_num(sd).astype(np.float32))))
-    if min(grid.shape) > 1:  # between the voxels of a single slice there are no cells
-        files.append(_vtu(folder / "displacement.vtu", grid, measured))
+    if cells is not None:
+        files.append(_vtu(folder / "displacement.vtu", grid, measured, *cells))
     files.append(_field(folder / "field.h5", pair, measured))
     files.append(write_volume(folder / "mask.mha", grid.with_values(measured.mask.astype(np.uint8))))
     files += [
@@ -342,18 +346,27 @@ def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement) -> Path:
-    """Write the object as hexahedra between voxels, subsampled for ParaView."""
+def _cells(measured: MeasuredDisplacement, grid: Volume) -> tuple[IntArray, int]:
+    """Return hexahedra (n, 8) between some voxels of the object, and that these are every so many."""
     known = np.isfinite(measured.displacement.vectors).all(axis=-1) & measured.mask
     step = 1
     while known[::step, ::step, ::step].sum() > MESH_CELLS:
         step += 1
     some = (slice(None, None, step),) * 3
     nz, ny, nx = known[some].shape
-    cells = grid_cells(nx - 1, ny - 1, nz - 1)
+    cells = grid_cells(nx, ny, nz)
     cells = cells[known[some].ravel()[cells].all(axis=1)]
     if not len(cells):
-        raise InputError("the displacement is known at too few neighbouring voxels for a mesh; enlarge the mask")
+        raise InputError(
+            f"the displacement was found at {known.sum()} of {measured.mask.sum()} voxels of the object only, too few for a mesh: "
+            "check that both scans show the same object, or enlarge the mask"
+        )
+    return cells, step
+
+
+def _vtu(path: Path, grid: Volume, measured: MeasuredDisplacement, cells: IntArray, step: int) -> Path:
+    """Write the object as hexahedra between voxels, subsampled for ParaView."""
+    some = (slice(None, None, step),) * 3
     used, numbers = np.unique(cells, return_inverse=True)
     mesh = Mesh.from_arrays(grid.positions()[some].reshape(-1, 3)[used], numbers.reshape(cells.shape), "hexahedron")
     data: dict[str, FloatArray] = {

@@ -175,7 +175,11 @@ def sense_blocks(
     folder = output_folder(out, () if resume else (*FILES, *STORES, *(LEVELS if multiscale else ())), overwrite=overwrite)
     of = {role: _identity(path, opened[role]) for role, path in paths.items() if path is not None}
     used = kept.begin(of, {"factor": plan.factor, "edge": plan.edge}, resume=resume, overwrite=overwrite)
-    found = correlate_blocks(a, b, mask=opened["mask"], deformed_mask=opened["deformed_mask"], **used, runner=kept, progress=progress)
+    try:
+        found = correlate_blocks(a, b, mask=opened["mask"], deformed_mask=opened["deformed_mask"], **used, runner=kept, progress=progress)
+    except InputError:
+        kept.forget()
+        raise
     stores = _written(found, a, kept, folder)
     report_progress(progress, "page and figures")
     inputs = input_record({role: path for role, path in paths.items() if path is not None})

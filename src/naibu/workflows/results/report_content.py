@@ -6,8 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import FloatArray
+from naibu.core.experiment import Experiment
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
@@ -18,6 +20,7 @@ from naibu.identification.prediction.cross_validation import LeftOut, ModelRow
 from naibu.identification.prediction.platen_position import marker_layers
 from naibu.identification.prediction.prediction import Prediction
 from naibu.identification.verdict import Explanation, Verdict
+from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
 from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, VerdictNote
 from naibu.viewer.tables import Cell, Table
@@ -126,12 +129,12 @@ def scene(specimen: Specimen, state: str, fit: LoadCaseFit, measured: FloatArray
     nodes, local = np.unique(boundary.faces, return_inverse=True)
     faces = triangles_of_faces(local.reshape(boundary.faces.shape))
     steps = []
-    paths = specimen.indenter_paths(values, state)
+    indenters = specimen.moved_indenters(values, state)
     experiment = specimen.experiment
     for s in fit.solution.states:
         markers = body.marker_points + body.at_markers(fit.since_scan(s.displacement))
-        boxes = tuple(_box(specimen, start + s.load * (stop - start), normal) for start, stop, normal in paths)
-        travel = float(max(np.linalg.norm(stop - start) for start, stop, _ in paths))
+        boxes = tuple(_box(specimen.experiment, c, s.load) for c in indenters)
+        travel = float(max(np.linalg.norm(c.stop - c.start) for c in indenters))
         label = f"{100 * s.load:.0f} % of the load" if s.load < 1.0 else "full load"
         steps.append(
             Step(label, s.load * travel, whole.mesh.points[nodes] + whole.field(fit.since_scan(s.displacement))[nodes], markers, boxes)
@@ -146,21 +149,20 @@ def scene(specimen: Specimen, state: str, fit: LoadCaseFit, measured: FloatArray
     )  # fmt: skip
 
 
-def _box(specimen: Specimen, position: FloatArray, normal: FloatArray) -> Box:
-    """A slab whose face touches the object, drawn for a plate or bar."""
-    size = 0.5 * np.array(specimen.experiment.shape.size_mm) + 4.0
-    half = size.copy()
+def _box(experiment: Experiment, indenter: Contact, load: float) -> Box:
+    """A slab whose face touches the object, drawn for a plate or bar at a fraction of its path."""
+    half = 0.5 * np.array(experiment.shape.size_mm) + 4.0
+    normal = indenter.surface.normal
     axis = int(np.argmax(np.abs(normal)))
     half[axis] = 2.0
-    loading = specimen.experiment.loading
+    loading = experiment.loading
     if loading.kind == "bar" and loading.bar_width_mm:
         half["xy".index("x" if loading.bar_axis == "y" else "y")] = loading.bar_width_mm / 2.0
         half[2] = 5.0
-    centre = position - normal * half[axis]
-    if axis != 2:
-        centre = centre + np.array([0.0, 0.0, size[2] - 4.0])
-    (x, y, z), (a, b, c) = centre.tolist(), half.tolist()
-    return Box((x, y, z), (a, b, c))
+    turned = indenter.orientation(load)
+    (x, y, z), (a, b, c) = (indenter.position(load) - turned @ (normal * half[axis])).tolist(), half.tolist()
+    qx, qy, qz, qw = Rotation.from_matrix(turned).as_quat().tolist()
+    return Box((x, y, z), (a, b, c), (qx, qy, qz, qw))
 
 
 def load_case_scene(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float], role: str = "fitted") -> Scene:

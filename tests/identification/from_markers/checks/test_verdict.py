@@ -93,7 +93,9 @@ def test_a_uniform_deformation_is_explained_but_tells_little() -> None:
 
 
 def test_estimates_far_from_what_was_known_count() -> None:
-    assert judged(case(), deviations={"box: base_offset": -3.7}).explanation is Explanation.EXPLAINED
+    found = judged(case(), deviations={"box: base_offset": -3.7, "a: friction": 2.9})
+    assert found.explanation is Explanation.EXPLAINED and "base_offset lies 3.7 standard deviations" in " ".join(found.notes)
+    assert "friction" not in " ".join(found.notes)
     assert judged(case(), deviations={"box: base_offset": -6.0}).explanation is Explanation.IN_PART
     found = judged(case(), deviations={"a: friction": 0.1, "box: base_offset": 14.0})
     assert found.explanation is Explanation.NOT_EXPLAINED and "box: base_offset lies 14 standard deviations" in found.sentence

@@ -231,6 +231,25 @@ def _stepped(law: FieldLaw, lame: FloatArray, shear: FloatArray, u: FloatArray, 
     return u - step, force
 
 
+def settled(
+    law: FieldLaw, solvers: Solvers, points: FloatArray, lame: FloatArray, shear: FloatArray, load_case: FieldLoadCase, guess: FloatArray
+) -> FloatArray:
+    """Return the displacement (n, d), mm, in equilibrium, with the loaded components as in `guess`, sought from there, then from rest.
+
+    A displacement that larger cells lend to small ones is rough at borders of stiff zones, beyond what Newton's method overcomes.
+
+    Raises
+    ------
+    ConvergenceError
+        Newton's method fails from this guess, and the path of the load from rest ends early.
+    """
+    try:
+        return equilibrium(law, solvers, lame, shear, load_case, guess, b"")[0]
+    except ConvergenceError:
+        start = loaded_from_rest(law, points, lame, shear, load_case, guess)
+        return equilibrium(law, solvers, lame, shear, load_case, np.where(load_case.loaded, guess, start), b"")[0]
+
+
 def loaded_from_rest(
     law: FieldLaw, points: FloatArray, lame: FloatArray, shear: FloatArray, load_case: FieldLoadCase, moved: FloatArray
 ) -> FloatArray:

@@ -19,7 +19,8 @@ from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoad
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import logarithms, young_and_poisson
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt, logarithms_of_regions, parts_within_cells
-from naibu.identification.from_fields.identified.stored_body import check_stored_body
+from naibu.identification.from_fields.identified.stored_body import UNITS_OF_MULTIPLES, check_stored_body
+from naibu.identification.stored_values import UNITS
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 FORMAT = "naibu field model 1"
@@ -137,6 +138,14 @@ class IdentifiedBody:
         return replace(self, mesh=Refinement.of(self.mesh).mesh, parts=parts, known_of_cell=self.known_of_cell[every], eighths=None)
 
     @property
+    def unit(self) -> str:
+        """Unit of Young's modulus, in words where it is a modulus that was not stated."""
+        if not self.relative or self.known:
+            return "multiples of the known zone" if self.relative else "kPa"
+        cell_by_cell = 2 * len(self.zones) > self.mesh.n_cells  # a map that no regions explain
+        return "multiples of the median" if cell_by_cell else "multiples of the largest region"
+
+    @property
     def cell_zones(self) -> Zones:
         """The cells as zones of their own, those of known moduli left out."""
         unknown = self.known_of_cell == KNOWN
@@ -188,7 +197,7 @@ class IdentifiedBody:
         """Return the body as plain numbers and strings, for JSON."""
         return {
             "format": FORMAT,
-            "units": "mm, kg, s, mN, kPa",
+            "units": UNITS_OF_MULTIPLES if self.relative else UNITS,
             "law": self.law,
             "relative": self.relative,
             "zones": [{"name": name} for name in self.zones],

@@ -11,6 +11,7 @@ from naibu.core.arrays import LENGTHS_MM, FloatArray
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.stored_values import UNITS, array_of, check_covariance, require, require_number, rows_of
 
+UNITS_OF_MULTIPLES = "mm, kg, s; moduli without unit, as multiples of one of them"
 LOGARITHMS = 60.0  # of moduli in kPa, beyond which nothing is elastic
 ORTHONORMAL = 1e-6
 WHOLE = 1e-6  # by which the parts of a cell may miss 1
@@ -29,7 +30,8 @@ def check_stored_body(data: Mapping[str, Any]) -> None:
     InputError
         A missing entry, one of another type or out of its range, cells without volume, or a covariance that is none.
     """
-    require(data.get("units") == UNITS, "units", data.get("units"), f"must be {UNITS!r}")
+    units = (UNITS, UNITS_OF_MULTIPLES) if data.get("relative") else (UNITS,)  # relative ones once said kPa as well
+    require(data.get("units") in units, "units", data.get("units"), f"must be {units[-1]!r}")
     require(data.get("law") in get_args(LawName), "law", data.get("law"), f"must be one of {', '.join(get_args(LawName))}")
     require(isinstance(data.get("relative"), bool), "relative", data.get("relative"), "must be true or false")
     require(data.get("cell_type") == "hexahedron", "cell_type", data.get("cell_type"), "must be 'hexahedron'")

@@ -15,7 +15,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress
-from naibu.identification.from_fields.assumptions import Assumption, effects
+from naibu.identification.from_fields.assumptions import Assumption
 from naibu.identification.from_fields.estimate import TOO_COARSE, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
@@ -30,8 +30,8 @@ from naibu.identification.from_fields.forward.load_cases import (
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.regularization import cell_volumes, inner_faces
-from naibu.identification.from_fields.uncertainty import Uncertainty, intervals, report, young_and_poisson_slopes
-from naibu.identification.verdict import Explanation
+from naibu.identification.from_fields.statement import statement
+from naibu.identification.from_fields.uncertainty import Uncertainty, young_and_poisson_slopes
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 
@@ -137,14 +137,10 @@ def _divided(theta: FloatArray, unit: float) -> FloatArray:
 
 def _in_words(found: FieldEstimate, theta: FloatArray, uncertainty: Uncertainty, others: tuple[Assumption, ...]) -> tuple[str, ...]:
     """Return verdict, how well multiples are determined, and what other assumptions would do."""
-    judged = found.verdict
-    head = () if judged is None else (judged.sentence, *judged.notes)
-    coarse = tuple(line for line in found.identifiability if line == TOO_COARSE)
-    sure = judged is not None and judged.explanation is Explanation.EXPLAINED and not coarse
-    how_well = report(found.zones, theta, uncertainty, usable=judged is None or judged.ok, sure=sure, unit=found.zones.unit)
-    told = effects(others, found.zones, theta, intervals(theta, uncertainty)[0])
-    unit = f"Moduli are multiples of that of {found.zones.names[int(np.argmax(_volumes(found)))]}, the largest region."
-    return (*head[:1], *coarse, unit, *head[1:], *how_well, *told)
+    assert found.verdict is not None  # of regions that were fitted without a penalty
+    limits = tuple(line for line in found.identifiability if line == TOO_COARSE)
+    measure = f"Moduli are multiples of that of {found.zones.names[int(np.argmax(_volumes(found)))]}, the largest region."
+    return statement(found.verdict, found.zones, theta, uncertainty, others, limits=limits, measure=(measure,))
 
 
 def _volumes(found: FieldEstimate) -> FloatArray:

@@ -31,7 +31,7 @@ NOISE_OVERSTATED = 0.5
 UNEXPLAINED = 0.4  # of the deformation left by a model that does not explain it
 NO_GAIN, WORSE = 0.95, 1.5  # residual over that of an affine map: nothing is gained; something is wrong even within the noise
 SHARED, SHARED_NOISE = 0.1, 1.5  # the part of the residual that neighbours share, over the deformation and over the noise
-FAR_PRIOR, VERY_FAR_PRIOR = 5.0, 10.0  # standard deviations of a prior
+OFF_PRIOR, FAR_PRIOR, VERY_FAR_PRIOR = 3.0, 5.0, 10.0  # standard deviations of a prior: worth a note, a flaw, a grave one
 FAR_HEIGHT, VERY_FAR_HEIGHT = 0.5, 1.5  # difference of found and stated height over the stated compression
 WHITE = 0.3  # shared part of a residual that is like noise
 MANY = 0.04  # of the markers left out, which is no longer a few
@@ -182,8 +182,9 @@ def verdict(
             flaws.append(_Flaw(f"{left_out} markers of {case.name} were left out as outliers"))
         flaws += _fit_flaws(case) + _height_flaws(case)
     heights = tuple(f"{c.name}: " for c in cases if c.expected_mm is not None)
-    for name, d in deviations.items():
-        if abs(d) > FAR_PRIOR and not (name.startswith(heights) and name.endswith((": height", ": width"))):
+    counted = {n: d for n, d in deviations.items() if not (n.startswith(heights) and n.endswith((": height", ": width")))}
+    for name, d in counted.items():
+        if abs(d) > FAR_PRIOR:
             text = f"{name} lies {abs(d):.0f} standard deviations from what was known of it beforehand"
             flaws.append(_Flaw(text, abs(d) > VERY_FAR_PRIOR))
     if not status.ok:
@@ -197,7 +198,7 @@ def verdict(
     shared = shared_part([(c.points, c.residual) for c in cases]).correlation
     return Verdict(
         explanation, tuple(f.text for f in flaws), _lead(cases, noise_factor, left), noise_factor, left, shared,
-        _notes(cases, noise_factor), _left_out(outliers, cases),
+        _notes(cases, noise_factor, counted), _left_out(outliers, cases),
     )  # fmt: skip
 
 
@@ -252,8 +253,13 @@ def _worst_zone(c: CaseEvidence) -> str:
     return f"{name} along {'xyz'[axis]} ({_rms(c.residual[zones[name]][:, axis : axis + 1]):.2g} mm)"
 
 
-def _notes(cases: Sequence[CaseEvidence], noise_factor: float) -> tuple[str, ...]:
-    notes = []
+def _notes(cases: Sequence[CaseEvidence], noise_factor: float, deviations: dict[str, float]) -> tuple[str, ...]:
+    notes = [
+        f"{name} lies {abs(d):.1f} standard deviations from what was known of it beforehand: it may make up for something that the model "
+        "does not describe."
+        for name, d in deviations.items()
+        if OFF_PRIOR < abs(d) <= FAR_PRIOR
+    ]
     if noise_factor < NOISE_OVERSTATED:
         notes.append(
             f"Residuals are {noise_factor:.2g} times the stated noise, which is thus overstated about "

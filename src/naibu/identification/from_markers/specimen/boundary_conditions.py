@@ -50,8 +50,10 @@ def rigid_bodies(
     if loading.kind == "side_plates":
         axis = "xyz".index(loading.bar_axis)
         for sign, side in ((-1.0, "low"), (1.0, "high")):
-            inward = (-sign, 0.0, 0.0) if axis == 0 else (0.0, -sign, 0.0)
-            bodies.append(body(f"indenter ({side} side) of {counter}", plane_geometry(inward), -0.5 * size[axis] * np.array(inward)))
+            inward = np.array([-sign, 0.0, 0.0] if axis == 0 else [0.0, -sign, 0.0])
+            # a plate leans about half of the object's height, so that the angle does not change the distance there
+            middle = np.array([0.0, 0.0, 0.5 * size[2]]) - 0.5 * size[axis] * inward
+            bodies.append(body(f"indenter ({side} side) of {counter}", plane_geometry(inward), middle))
     elif loading.kind == "bar":
         surface = bar_geometry(loading.bar_axis, loading.bar_width_mm or 0.0)
         bodies.append(body(f"indenter of {counter}", surface, (0.0, 0.0, size[2])))

@@ -69,3 +69,23 @@ def platen_position(experiment: Experiment, state: str) -> str:
     """Name of the height of the plate or bar above the base, or of the distance between side plates, in a state."""
     kind = "width" if experiment.loading.kind == "side_plates" else "height"
     return f"{experiment.name}/{state}: {kind}"
+
+
+def side_plate_tilt(experiment: Experiment, state: str) -> str:
+    """Name of the angle by which both side plates lean towards the object in a state, rad: positive where they are closer above."""
+    return f"{experiment.name}/{state}: tilt"
+
+
+def plate_tilt(experiment: Experiment, state: str, axis: str) -> str:
+    """Name of the rotation of a plate or bar about a horizontal axis, ``"x"`` or ``"y"``, in a state, rad."""
+    return f"{experiment.name}/{state}: tilt_{axis}"
+
+
+def bar_offset(experiment: Experiment, state: str) -> str:
+    """Name of the distance of a bar from the middle of the object in a state, mm."""
+    return f"{experiment.name}/{state}: bar_offset"
+
+
+def bar_yaw(experiment: Experiment, state: str) -> str:
+    """Name of the rotation of a bar about the vertical in a state, rad."""
+    return f"{experiment.name}/{state}: bar_yaw"

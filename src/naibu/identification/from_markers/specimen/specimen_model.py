@@ -13,8 +13,8 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Layer
 from naibu.core.mesh import Mesh
-from naibu.core.rigid_transform import rotation_matrix
 from naibu.identification.from_markers.specimen.boundary_conditions import material_of, rigid_bodies, sliding_joints
+from naibu.identification.from_markers.specimen.indenter_path import moved_indenter, path_directions
 from naibu.identification.from_markers.specimen.marker_grid import completed
 from naibu.identification.from_markers.specimen.mirror_planes import MirrorPlanes, WholeBody
 from naibu.identification.from_markers.specimen.parameter_names import (
@@ -26,7 +26,6 @@ from naibu.identification.from_markers.specimen.parameter_names import (
     law_of_shape,
     layer_shift,
     pixel_scale,
-    platen_position,
     poisson_ratio,
     shape_parameter,
     straight_base,
@@ -136,10 +135,9 @@ class Specimen:
         """Indices of the contacts that move."""
         return tuple(i for i, c in enumerate(self._contacts) if not np.array_equal(c.start, c.stop) or c.name.startswith("indenter"))
 
-    def indenter_paths(self, values: Mapping[str, float], state: str) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-        """Return start and end of the path (3,), mm, and the outward normal (3,) of every indenter in a state."""
-        moved = [self._moved(self._contacts[i], values, state) for i in self.indenters]
-        return [(c.start, c.stop, c.orientation(1.0) @ c.surface.normal) for c in moved]
+    def moved_indenters(self, values: Mapping[str, float], state: str) -> list[Contact]:
+        """Return the indenters on their paths to a state."""
+        return [moved_indenter(self._contacts[i], self.experiment, state, values) for i in self.indenters]
 
     @property
     def whole(self) -> WholeBody:
@@ -250,7 +248,7 @@ class Specimen:
         contacts = []
         for i in range(len(body._contacts)):
             changed = body._with_friction(i, values)
-            contacts.append(self._moved(changed, values, state) if i in self.indenters else changed)
+            contacts.append(moved_indenter(changed, self.experiment, state, values) if i in self.indenters else changed)
         assembler = body._assembler.with_parameters(self.material_parameters(values))
         weight = np.zeros((self.mesh.n_points, 3))
         if self.experiment.loading.kind == "side_plates":
@@ -275,7 +273,7 @@ class Specimen:
         if (points := self.shift(name, values)) is not None:
             out.append(Direction(points=points))
         for i in self.indenters:
-            path = self._path_directions(self._contacts[i], state).get(name)
+            path = path_directions(self._contacts[i], self.experiment, state).get(name)
             if path is not None:
                 out.append(replace(path, contact=i))
         return out
@@ -327,37 +325,6 @@ class Specimen:
         if self.settings.contact == "stick" and not contact.name.startswith("joint"):
             given = np.full_like(given, STICK)
         return replace(contact, friction_coefficient=given)
-
-    def _moved(self, contact: Contact, values: Mapping[str, float], state: str) -> Contact:
-        """Set the ends of the body's path, its yaw and its tilt from the state's parameters."""
-        start, stop, yaw, tilt = contact.start.copy(), contact.stop.copy(), np.zeros(3), np.zeros(3)
-        for name, rate in self._path_directions(contact, state).items():
-            reference = self._reference(contact, name, state)
-            change = values.get(name, reference) - reference
-            for target, by in ((start, rate.start), (stop, rate.stop), (yaw, rate.rotation), (tilt, rate.tilt)):
-                if by is not None:
-                    target += by * change
-        return replace(contact, start=start, stop=stop, rotation=rotation_matrix(yaw) @ contact.rotation, tilt=tilt)
-
-    def _reference(self, contact: Contact, name: str, state: str) -> float:
-        """Value of a path parameter at which the body is at its start."""
-        if name == platen_position(self.experiment, state):
-            return self.experiment.full_platen_position_mm
-        return 0.0
-
-    def _path_directions(self, contact: Contact, state: str) -> dict[str, Direction]:
-        """How every parameter of the state moves the body, per unit of the parameter."""
-        x, y, z = np.eye(3)
-        name = platen_position(self.experiment, state)
-        if self.experiment.loading.kind == "side_plates":
-            return {name: Direction(stop=-0.5 * contact.surface.normal)}
-        prefix = f"{self.experiment.name}/{state}"
-        out = {name: Direction(stop=z), f"{prefix}: tilt_x": Direction(tilt=x), f"{prefix}: tilt_y": Direction(tilt=y)}
-        if self.experiment.loading.kind == "bar":
-            lateral = x if self.experiment.loading.bar_axis == "y" else y
-            out[f"{prefix}: bar_offset"] = Direction(start=lateral, stop=lateral)
-            out[f"{prefix}: bar_yaw"] = Direction(rotation=z)
-        return out
 
 
 def specimen(experiment: Experiment, settings: ModelSettings | None = None, *, whole: bool = False) -> Specimen:

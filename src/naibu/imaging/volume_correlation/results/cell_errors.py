@@ -1,6 +1,8 @@
-"""Variances of the errors of volume correlation by cells of its grid: noise, bias of the penalty, structures at the wrong place, strain."""
+"""Variances of the errors of volume correlation by cells of its grid: noise, bias by penalties, structures at the wrong place, strain."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from scipy import ndimage
@@ -12,9 +14,10 @@ from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
 SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples
 REMAINING = 5.0  # empirical: last steps that a cell which has not converged may still be away from the solution
-# empirical: standard deviation along every axis of the bias by the bending penalty, in lengths of the change that smoothing the field once
-# more makes. Errors of legs and chests exceed what the samples say by 4 to 5 such lengths in three axes, and along the change only in part
-BIAS, BIAS_TOLERANCE = 1.9, 0.03
+# empirical: standard deviation along every axis of the bias by the penalties of bending and of dilatation, in lengths of the change that
+# penalising the field once more makes. Errors of legs and chests exceed what the samples say by 4 to 5 such lengths in three axes, and
+# along the change only in part; that by dilatation shows in legs, most beside bones, that by bending in chests
+BENDING_BIAS, DILATATION_BIAS, BIAS_TOLERANCE = 1.9, 2.2, 0.03
 # empirical: mean square of the residuals of a cell, in variances of the noise, beyond which structures lie at the wrong place there. Edges
 # in legs reach 8 in one cell of a hundred; lungs that slide by 5 to 17 mm along the chest wall 8 to 100 in one cell of twenty
 MISPLACED = 8.0
@@ -47,20 +50,31 @@ def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray
     return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
 
 
-def bias_variance(fit: CorrelationFit, smoothed: Float32Array) -> FloatArray:
-    """Return the variance (m,), mm^2 along every axis, of the bias by the bending penalty, as in the notes of `collected`.
+def biases(fit: CorrelationFit, c: FloatArray, bending: FloatArray, dilatation: float) -> tuple[Float32Array, ...]:
+    """Return coefficients (n, 3), mm, as large as the standard deviation along every axis of the bias, for either penalty.
 
-    `smoothed` (n, 3) are the coefficients of what smoothing once more takes away. It is taken at voxels: the middle of a cell at the
-    surface may lie far outside of the object, where splines extrapolate.
+    They are what penalising a field once more takes away: see the notes of `collected`.
+    """
+    system = fit.system
+    loads = system.bending_load(c, bending), system.dilatation_load(c, dilatation * system.gauss_volume)
+    factors = BENDING_BIAS, DILATATION_BIAS
+    return tuple(np.float32(factor) * system.solved(load, BIAS_TOLERANCE)[0] for factor, load in zip(factors, loads, strict=True))
+
+
+def bias_variance(fit: CorrelationFit, bias: Sequence[Float32Array]) -> FloatArray:
+    """Return the variance (m,), mm^2 along every axis, of the bias by the penalties, whose sizes `biases` returns.
+
+    It is taken at voxels: the middle of a cell at the surface may lie far outside of the object, where splines extrapolate.
     """
     system = fit.system
     cells, at = _some_voxels(fit)
-    full = np.zeros((*system.active.shape, 3))
-    full[system.active] = smoothed
-    square = (system.grid.values(full, fit.level.index[at] * fit.level.spacing) ** 2).sum(axis=1)
+    full, square = np.zeros((*system.active.shape, 3)), np.zeros(len(at))
+    for coefficients in bias:
+        full[system.active] = coefficients
+        square += (system.grid.values(full, fit.level.index[at] * fit.level.spacing) ** 2).sum(axis=1)
     m = len(system.cells)
     total, count = (fit.windowed(np.bincount(cells, w, minlength=m).astype(float), SHARED) for w in (square, None))
-    return np.asarray(BIAS**2 * total / count)
+    return np.asarray(total / count)
 
 
 def misplacement_variance(fit: CorrelationFit, misfit: FloatArray) -> FloatArray:
@@ -74,10 +88,10 @@ def misplacement_variance(fit: CorrelationFit, misfit: FloatArray) -> FloatArray
     return np.asarray(ndimage.maximum_filter(np.nan_to_num(of_cell), 3)[tuple(fit.system.cells[:, 2:].T)])
 
 
-def strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, smoothed: Float32Array) -> FloatArray:
+def strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, bias: Sequence[Float32Array]) -> FloatArray:
     """Return the mean square error (m,) of a component of the Green-Lagrange strain in the middles of the cells.
 
-    Both parts are as those of the displacement: the samples, and the bias, whose direction is unknown, three times.
+    Both parts are as those of the displacement: the samples, and the `biases`, whose direction is unknown, three times.
     """
     system = fit.system
     deformation = np.eye(3) + _gradients_at_middles(fit, c)
@@ -89,7 +103,8 @@ def strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, s
         return np.asarray(((0.5 * (change + np.swapaxes(change, -1, -2))) ** 2).mean(axis=(-2, -1)))
 
     drawn = sum((mean_square(samples[..., s]) for s in range(samples.shape[2])), start=np.zeros(len(system.cells)))
-    return _averaged(fit, drawn / samples.shape[2] + 3.0 * BIAS**2 * mean_square(smoothed))
+    biased = sum((mean_square(coefficients) for coefficients in bias), start=np.zeros(len(system.cells)))
+    return _averaged(fit, drawn / samples.shape[2] + 3.0 * biased)
 
 
 def _gradients_at_middles(fit: CorrelationFit, c: FloatArray) -> FloatArray:

@@ -16,9 +16,9 @@ from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.results.cell_errors import (
-    BIAS_TOLERANCE,
     REMAINING,
     bias_variance,
+    biases,
     misplacement_variance,
     per_cell,
     sampled_covariance,
@@ -48,6 +48,8 @@ class CorrelationResult:
     cell_strain_sd : ndarray, shape (CZ, CY, CX)
         Standard deviation of a component of the Green-Lagrange strain in the middle of every cell, root mean square over the components;
         NaN where there is no object.
+    cell_bias : ndarray, shape (CZ, CY, CX)
+        Variance along every axis, mm^2, of the bias by the penalties, a part of the covariance; NaN where there is no object.
     cell_misplacement : ndarray, shape (CZ, CY, CX)
         Variance along every axis, mm^2, of displacements that would explain residuals far above the noise, a part of the covariance: 0
         where structures lie on one another after registration, NaN where there is no object.
@@ -75,6 +77,7 @@ class CorrelationResult:
     coefficients: FloatArray
     cell_covariance: FloatArray
     cell_strain_sd: FloatArray
+    cell_bias: FloatArray
     cell_misplacement: FloatArray
     bending: FloatArray
     dilatation: float
@@ -163,6 +166,10 @@ class CorrelationResult:
     def misplacement_at(self, points_mm: ArrayLike) -> FloatArray:
         """Return `cell_misplacement` (n,), mm^2, at positions (n, 3), mm; NaN away from the object."""
         return self._between_cells(self.cell_misplacement, self._local(points_mm))
+
+    def bias_at(self, points_mm: ArrayLike) -> FloatArray:
+        """Return `cell_bias` (n,), mm^2, at positions (n, 3), mm; NaN away from the object."""
+        return self._between_cells(self.cell_bias, self._local(points_mm))
 
     def strain_sd(self) -> Float32Array:
         """Return the standard deviation of a component of strain (nz, ny, nx) at the voxels; NaN where it is not valid, 0 in inclusions."""
@@ -283,9 +290,10 @@ def collected(
 
     Notes
     -----
-    The samples hold the error of fields as rough as the penalty assumes. That of others is a bias, whose size is estimated by smoothing
-    the field once more, as in Tukey's twicing :cite:p:`tukey1977`. Its direction is not: what the penalty took from the true field was not
-    parallel to what it takes from its estimate. It is therefore added as a variance along every axis. So is what large residuals tell of
+    The samples hold the error of fields as rough, and as far from constant volume, as the penalties assume. That of others is a bias, whose
+    size is estimated by smoothing the field once more, as in Tukey's twicing :cite:p:`tukey1977`, and by penalising its dilatation once
+    more. Its direction is not: what a penalty took from the true field was not parallel to what it takes from its estimate. Both are
+    therefore added as variances along every axis. So is what large residuals tell of
     structures that no smooth field brings together, such as those on either side of organs that slide on each other.
     """
     system, level = fit.system, fit.level
@@ -312,18 +320,19 @@ def collected(
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
         full[~valid] = np.nan
-    smoothed = fit.system.solved(fit.system.bending_load(c, bending), BIAS_TOLERANCE)[0]
+    bias = biases(fit, c, bending, dilatation)
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
     misplaced = misplacement_variance(fit, misfit)
-    variance = bias_variance(fit, smoothed) + remaining + misplaced
+    biased = bias_variance(fit, bias)
+    variance = biased + remaining + misplaced
     spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
     covariance = per_cell(system.grid, fit, spread)
-    strain_sd = np.sqrt(strain_variance(fit, c, samples, smoothed) + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2)
+    strain_sd = np.sqrt(strain_variance(fit, c, samples, bias) + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2)
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
-        per_cell(system.grid, fit, strain_sd), per_cell(system.grid, fit, misplaced), per_cell(system.grid, fit, bending), dilatation,
+        *(per_cell(system.grid, fit, values) for values in (strain_sd, biased, misplaced, bending)), dilatation,
         fit.residual_sd, maps[0], maps[1], converged, inclusions, motions, _status(system.grid, volume, converged),
     )  # fmt: skip
 

@@ -92,7 +92,7 @@ class RealTimeSession(TangentSession):
         Whether `step_within` has begun a step whose balance is not yet found.
     unbalanced : float
         Sum of the nodes' out-of-balance forces at the end of the last step, which the next steps take up, as a fraction of the sum of all
-        forces or of those of contact, whichever is more; of a step that is under way, at the best state found so far.
+        forces or of those of contact, whichever is more; 0 where Newton's method took it.
     """
 
     newton_steps: int = field(init=False, default=0)
@@ -151,7 +151,7 @@ class RealTimeSession(TangentSession):
     def _settled(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> tuple[tuple[Contact, ...], FloatArray | None]:
         """Return contacts as the next step shall have them, stiffer where a balanced step went too deep, and the displacement."""
         u = self._balanced(h, moving, contacts)
-        if u is None or self.unbalanced > PASSABLE:
+        if u is None or (self._trial is not None and self._trial.unbalanced > PASSABLE):
             return contacts, u
         out = []
         for c, first, depth in zip(contacts, self._templates, self._depths(contacts, u), strict=True):
@@ -166,7 +166,6 @@ class RealTimeSession(TangentSession):
             if self._trial is not None:
                 return self._trial.displacement
             self.newton_steps += 1
-            self.unbalanced = 0.0
         self._pressure, self._trial, self._near, self._gaps = None, None, (), ()
         return DynamicSession._balanced(self, h, moving, contacts)
 
@@ -217,7 +216,7 @@ class RealTimeSession(TangentSession):
             return None
         for near in self._near:  # gaps and responses are those of the last trial
             near.add_force(best.displacement, np.zeros_like(best.displacement))
-        self.unbalanced, self._spare = max(best.error, best.felt), self.iterations == before
+        self._spare = self.iterations == before
         return best
 
     def _from_guesses(
@@ -289,7 +288,6 @@ class RealTimeSession(TangentSession):
                 return trial
             if k and trial.passable(bulk) and ((k >= USUAL and trial.felt <= FELT) or time.thread_time() > deadline):
                 return trial
-            self.unbalanced = max(best.error, best.felt)
             yield
             after = yield from self._improved(tangent, trial, inertial, mixing)
             if after is None or after.error > DIVERGED:
@@ -386,6 +384,7 @@ class RealTimeSession(TangentSession):
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
         trial, self._slipped = self._trial, self.reached.lips
+        self.unbalanced = 0.0 if trial is None else trial.unbalanced
         if trial is None:
             return DynamicSession._accepted(self, h, u, contacts, spin)
         of_indenters, anchors, gaps = np.zeros((len(contacts), 3)), [], []

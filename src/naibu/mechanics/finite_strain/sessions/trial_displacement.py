@@ -45,6 +45,11 @@ class Trial:
     error: float
     felt: float
 
+    @property
+    def unbalanced(self) -> float:
+        """What is out of balance, as a fraction of all forces or of the contact forces, whichever is more."""
+        return max(self.error, self.felt)
+
     def better(self, other: Trial | None) -> Trial:
         """Return the one nearer to balance."""
         return self if other is None or self.error <= other.error else other

@@ -166,12 +166,14 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
     for n in range(len(velocity)):
         if len(extension):
             forces_of_elements(blocks, tables, (x, v, extension), applied, external)
-        before[:] = v
-        base[:] = 0.0
-        for i in range(len(external)):
-            base[i] = step * external[i]
+        for i in range(len(v)):
+            before[i] = v[i]
+            base[i] = step * external[i] if i < len(external) else 0.0
         for h in range(len(weight)):
-            now[2][h] = weight[h] * (now[1][h] * held_velocity[n, now[3][h]]).sum()
+            along = 0.0
+            for a in range(now[1].shape[1]):
+                along += now[1][h, a] * held_velocity[n, now[3][h], a]
+            now[2][h] = weight[h] * along
         moving = (velocity[n], spin[n])
         _move_indenters(axes, centres, velocity[n], spin[n], step, history[4], first)
         count = near_faces(x, v, step, indenters, moving, surface, lists)

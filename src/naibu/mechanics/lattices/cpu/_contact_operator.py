@@ -87,8 +87,8 @@ def close_operator(operator, smoother, slot, diagonal):  # type: ignore[no-untyp
     corners, blocks, rough, nodes, inverse, counts, _, _ = operator
     found = 0
     for f in range(counts[FACES]):
-        for k in range(12):
-            for m in range(12):  # the others are zero
+        for k in range(12):  # one by one: the first assignment of arrays takes Numba a second to compile
+            for m in range(12):
                 rough[f, k, m] = blocks[f, k, m]
         for k in range(4):
             i = corners[f, k]

@@ -389,9 +389,8 @@ def assemble(count, step, surface, lists, linear, right, operator, d):  # type: 
                         for b in range(3):
                             block[3 * c + a, 3 * e + b] += both * d[a, b]
         if touched:
-            for c in range(4):
+            for c in range(4):  # one by one: the first assignment of arrays takes Numba a second to compile
                 nodes[used, c] = corners[f, c]
-            for c in range(4):
                 for e in range(c):
                     for a in range(3):
                         for b in range(3):

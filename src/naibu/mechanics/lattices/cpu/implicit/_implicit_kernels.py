@@ -41,7 +41,8 @@ def rigid_part(x, mass, impulse, out):  # type: ignore[no-untyped-def]  # pragma
         for a in range(3):
             centre[a] += mass[i] * x[a * pad + i]
             p[a] += impulse[a * pad + i]
-    centre /= weight
+    for a in range(3):
+        centre[a] /= weight
     for i in range(pad):
         if mass[i] > 0.0:
             d0, d1, d2 = x[i] - centre[0], x[pad + i] - centre[1], x[2 * pad + i] - centre[2]
@@ -60,7 +61,11 @@ def rigid_part(x, mass, impulse, out):  # type: ignore[no-untyped-def]  # pragma
     w = np.zeros(3)
     for k in range(3):
         if values[k] > 1e-12 * values[2]:  # nodes in a line do not turn about it
-            w += (vectors[:, k] * spin).sum() / values[k] * vectors[:, k]
+            along = 0.0
+            for a in range(3):
+                along += vectors[a, k] * spin[a]
+            for a in range(3):
+                w[a] += along / values[k] * vectors[a, k]
     for i in range(pad):
         d0, d1, d2 = x[i] - centre[0], x[pad + i] - centre[1], x[2 * pad + i] - centre[2]
         alive = 1.0 if mass[i] > 0.0 else 0.0

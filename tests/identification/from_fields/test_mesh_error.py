@@ -1,0 +1,61 @@
+"""What cells of half the size change: at finite strain, whatever the surface of the coarse ones does."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, logarithms, moduli_of
+from naibu.identification.from_fields.mesh_error import changes_on_finer_mesh
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
+from naibu.mechanics.finite_elements.elements import elements
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters, material
+from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
+from naibu.mechanics.finite_strain.statics import solve
+from naibu.meshing.point_location import interpolation_operator
+from naibu.meshing.primitives import box
+
+SIDE_MM, CELLS = 40.0, 5
+MODULI = {"bone": (150_000.0, 0.3), "muscle": (11.0, 0.45), "skin": (24.0, 0.45)}
+
+
+def limb(cells: int) -> Mesh:
+    """Return a limb with a bone along y, in a skin of 8 mm, of cubes."""
+    mesh = box([SIDE_MM] * 3, [cells] * 3, centred=False)
+    x, _, z = mesh.points[mesh.cells].mean(axis=1).T - SIDE_MM / 2
+    regions = np.where(np.maximum(np.abs(x), np.abs(z)) > 12.0, 2, np.where(np.maximum(np.abs(x), np.abs(z)) < 4.0, 0, 1))
+    return Mesh.from_arrays(mesh.points, mesh.cells, "hexahedron", regions=regions, region_names=tuple(MODULI))
+
+
+@pytest.mark.parametrize(("push_mm", "rough_mm"), [(10.0, 0.0), (14.0, 0.3)])
+def test_what_half_the_size_changes_is_that_of_an_equilibrium_reached_from_rest(push_mm: float, rough_mm: float) -> None:
+    """From the second surface Newton's method fails on small cells when it starts from the state of large ones."""
+    mesh, fine = limb(CELLS), limb(2 * CELLS)
+    x, y, z = mesh.points.T
+    surface = (np.isclose(mesh.points, 0.0) | np.isclose(mesh.points, SIDE_MM)).any(axis=1)
+    moved = rough_mm * np.random.default_rng(0).standard_normal(mesh.points.shape)
+    moved[:, 2] -= push_mm * np.exp(-((x - 20.0) ** 2 + (y - 20.0) ** 2) / 128.0) * (z / SIDE_MM) ** 2
+    loaded = np.repeat(surface[:, None], 3, axis=1)
+    points = np.random.default_rng(1).uniform(1.0, SIDE_MM - 1.0, (300, 3))
+    field = DisplacementField.from_arrays(points, np.ones_like(points), sd_mm=0.1)
+    zones = Zones.of(mesh, known={"bone": MODULI["bone"]})
+    theta = logarithms(*(np.array(v) for v in zip(*(lame_parameters(*MODULI[name]) for name in zones.names), strict=True)))
+    model = FieldModel(mesh, [FieldLoadCase.of("push", field, mesh, loaded=loaded)], zones, "neo_hookean", "accurate")
+    (start,) = model.from_rest(theta, [moved])
+    point = model.evaluate(theta, [np.where(loaded, moved, start)])
+    found = changes_on_finer_mesh(model.linearised(point), "neo_hookean", lambda _, of: moduli_of(of, theta))
+    assert found is not None and found[1] == "neo_hookean"
+
+    materials = [material("neo_hookean", young_modulus=e, poisson_ratio=nu) for e, nu in MODULI.values()]
+    body = Assembler.from_materials(elements(fine, "mean_dilatation"), fine.regions, materials)
+    outside = (np.isclose(fine.points, 0.0) | np.isclose(fine.points, SIDE_MM)).any(axis=1)
+    values = np.where(outside[:, None], interpolation_operator(mesh, fine.points) @ moved, 0.0)
+    held = PrescribedDisplacement(np.repeat(outside[:, None], 3, axis=1), values)
+    problem = Problem(fine.points, body, (), held, np.zeros_like(fine.points))
+    there = solve(problem, settings=SolverSettings(first_step=0.05, largest_step=0.1, tolerance=1e-8)).displacement
+    expected = (interpolation_operator(fine, points) @ there - interpolation_operator(mesh, points) @ point.states[0]) / 0.1
+    np.testing.assert_allclose(found[0][0].reshape(-1, 3), expected, atol=1e-3 * np.abs(expected).max())

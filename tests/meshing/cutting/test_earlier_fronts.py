@@ -1,0 +1,102 @@
+"""Cuts of meshes that were cut before, of which nothing but the mesh is known: they go on, or it is said where they do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import Delaunay
+
+from naibu.core.arrays import FloatArray
+from naibu.core.mesh import Mesh
+from naibu.meshing import BisectionForest, SweptBlade, VolumeCut, box, cut_volume, signed_volumes, swept_blade
+from naibu.meshing.cutting.earlier_fronts import front_edges
+
+SIZE = 20.0
+
+
+def cubes(seed: int) -> Mesh:
+    """Kuhn's cells, or, of an even seed, Delaunay's of random points."""
+    if seed % 2:
+        return box((SIZE, SIZE, SIZE), (4, 4, 4), cell_type="tetra")
+    rng, grid = np.random.default_rng(seed), box((SIZE, SIZE, SIZE), (3, 3, 3), cell_type="tetra").points
+    inside = np.abs(grid - [0.0, 0.0, 10.0]) < 9.9
+    moved = grid + np.where(inside, rng.uniform(-2.0, 2.0, grid.shape), 0.0)
+    points = np.concatenate([moved, rng.uniform([-9.0, -9.0, 1.0], [9.0, 9.0, 19.0], (20, 3))])
+    cells = Delaunay(points).simplices
+    volumes = np.linalg.det(points[cells[:, 1:]] - points[cells[:, :1]])
+    cells[volumes < 0.0] = cells[volumes < 0.0][:, [0, 1, 3, 2]]
+    return Mesh.from_arrays(points, cells[np.abs(volumes) > 1e-6], "tetra")
+
+
+class Path:
+    """A blade across the whole cube that moves on a plane, or on a wave, from 24 mm before its middle to 24 mm behind."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(1000 + seed)
+        self.edge, self.way, self.bulge = np.linalg.qr(rng.normal(size=(3, 3)))[0].T
+        self.centre = np.array([0.0, 0.0, 10.0]) + rng.uniform(-3.0, 3.0, 3)
+        self.height, self.distance, self.pause = rng.choice([0.0, 2.0]), float(rng.choice([2.0, 3.0, 5.0])), rng.uniform(-5.0, 5.0)
+
+    def swept(self, first: float, last: float) -> SweptBlade:
+        s = np.linspace(first, last, 9)[:, None]
+        line = self.centre + s * self.way + self.height * np.sin(0.15 * s) * self.bulge
+        return swept_blade(line[:, None] + np.array([[-40.0], [40.0]]) * self.edge)
+
+
+def sizes(cut: VolumeCut) -> FloatArray:
+    return np.bincount(cut.piece, signed_volumes(cut.mesh)).astype(float)
+
+
+@pytest.mark.parametrize("overlap", [0.0, 0.25, 1.0])
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_blade_goes_on_where_it_ended_or_it_is_said_that_it_does_not(overlap: float, kept: bool) -> None:
+    """Of the cut before, the mesh is known, or its forest, too; both pieces are as large as those of one cut."""
+    parted = 0
+    for seed in range(12):
+        path, mesh = Path(seed), cubes(seed)
+        once = cut_volume(mesh, path.swept(-24.0, path.pause), path.distance)
+        blade = path.swept(path.pause - overlap * path.distance, 24.0)
+        twice = cut_volume(once.mesh, blade, path.distance, forest=once.forest if kept else None)
+        assert twice.deviation_mm <= 0.5 * path.distance
+        assert signed_volumes(twice.mesh).sum() == pytest.approx(SIZE**3, rel=1e-12)
+        if twice.n_pieces == 1:
+            assert len(twice.bridges) > 0
+            continue
+        parted += 1
+        assert not len(twice.bridges)
+        whole = sizes(cut_volume(mesh, path.swept(-24.0, 24.0), path.distance))
+        np.testing.assert_allclose(sizes(twice)[:2], whole[:2], atol=0.02 * SIZE**3)
+    assert parted >= (12 if overlap == 1.0 else 11)
+
+
+def test_what_is_left_between_two_cuts_holds_and_is_not_spoken_of() -> None:
+    mesh = cubes(1)
+    once = cut_volume(mesh, _upright(0.3, -15.0, -6.0), 2.0)
+    twice = cut_volume(once.mesh, _upright(0.3, 6.0, 15.0), 2.0)
+    assert twice.n_pieces == 1 and twice.joined_mm == 0.0 and not len(twice.bridges)
+    alone = cut_volume(mesh, _upright(0.3, 6.0, 15.0), 2.0)
+    assert len(twice.faces) == len(alone.faces)
+
+
+def test_a_cut_along_the_end_of_another_meets_it() -> None:
+    """Three pieces, as if the first cut had been a little longer."""
+    once = cut_volume(cubes(1), _upright(0.3, -15.0, 1.0), 2.0)
+    twice = cut_volume(once.mesh, swept_blade([[[x, 1.0, -5.0], [x, 1.0, SIZE + 5.0]] for x in (-15.0, 0.0, 15.0)]), 2.0)
+    assert twice.joined_mm == pytest.approx(SIZE, rel=0.5)
+    expected = [9.0 * SIZE**2, 11.0 * 10.3 * SIZE, 11.0 * 9.7 * SIZE]
+    np.testing.assert_allclose(sizes(twice)[:3], expected, atol=1.01 * SIZE**2)  # half of the distance over a section
+
+
+def test_fronts_are_the_edges_at_which_a_cut_ends() -> None:
+    assert not len(front_edges(BisectionForest.of(cubes(1)))[0])
+    cut = cut_volume(box((SIZE, SIZE, SIZE), (4, 4, 4), cell_type="tetra"), _upright(0.0, -15.0, 0.1), 10.0)  # along faces of the mesh
+    edges = front_edges(BisectionForest.of(cut.mesh))[0]
+    ends = cut.mesh.points[edges]
+    np.testing.assert_allclose(ends[..., 0], 0.0, atol=1e-12)
+    assert np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() >= SIZE  # from the lower to the upper face
+    whole = cut_volume(cut.mesh, _upright(0.0, -15.0, 15.0), 10.0)
+    assert not len(front_edges(whole.forest)[0])
+
+
+def _upright(x: float, first: float, last: float) -> SweptBlade:
+    return swept_blade([[[x, y, -5.0], [x, y, SIZE + 5.0]] for y in np.linspace(first, last, 5)])
