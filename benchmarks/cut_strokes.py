@@ -69,9 +69,7 @@ def running_into(seed: int) -> tuple[bool, bool]:
         return swept_blade([[centre - 40.0 * u + b * across, centre + 40.0 * u + b * across] for b in np.linspace(first, last, 4)])
 
     along = swept(w, -40.0, 40.0)
-    twice, beyond = (
-        cut_volume(cut_volume(mesh, swept(v, -40.0, end), distance).mesh, along, distance) for end in (0.0, 2.0 * distance)
-    )
+    twice, beyond = (cut_volume(cut_volume(mesh, swept(v, -40.0, end), distance).mesh, along, distance) for end in (0.0, 2.0 * distance))
     return bool(np.allclose(sizes(twice)[:3], sizes(beyond)[:3], rtol=0.05, atol=0.02 * SIZE**3)), len(twice.bridges) > 0
 
 

@@ -113,7 +113,8 @@ def cut(
         CSV table. Of a blade: each row a pose, x, y, z in mm of the edge's first vertex, then of the second, and so on. Of the tip of a
         tool over a surface: each row x, y, z in mm.
     out
-        Folder for cut.html, cut.vtu (mesh with its pieces), cut.vtkhdf (motion) and cut.json.
+        Folder for cut.html, cut.vtu (mesh with its pieces), cut-surface.vtu (of solids: the faces of the cut), cut.vtkhdf (motion) and
+        cut.json.
     distance_mm
         Twice the largest distance of the cut from the path; half of the mean edge of the mesh or surface by default. Lattices are not
         refined: a cut of theirs farther away is refused.

@@ -2,8 +2,8 @@
 
 Two cubes that share a face are separated where the segment between their centres crosses the surface. Where cubes of an octree of two sizes
 meet, the face of the larger one is separated as a whole if any of these segments does. Around every node of these faces, cubes that other
-faces join keep one node, each other group of cubes gets a copy; so no cube hangs on another by a mere edge or node, cuts may end inside the
-lattice, and they may cross.
+faces join keep one node, each other group of cubes gets a copy, and so around nodes elsewhere whose cubes a cut parts in more pieces; so no
+piece hangs on another by a mere edge or node, cuts may end inside the lattice, and they may cross.
 
 An element belongs to the cubes that have both its nodes. Where the groups part them, it is divided in as many elements, and stiffness and
 dampings in proportion to the numbers of cubes; the mass of a node is divided by their volumes. So mass, momentum and energy are
@@ -211,7 +211,9 @@ def cut_lattice(lattice: Lattice, parameters: LatticeParameters, blade: SweptBla
     volumes = corner_volumes(lattice)
     cut = _crossed(where[cells].mean(axis=1), known, blade, volumes)
     parted = replace(known, joined=known.joined & ~cut)
-    new_cells, source = _separated(cells, known, parted, cut, lattice.n_nodes)
+    piece = _pieces(8.0 * volumes, parted)
+    apart = _of_more_pieces(cells, _pieces(8.0 * volumes, known), piece, lattice.n_nodes)
+    new_cells, source = _separated(cells, known, parted, cut, apart)
     faces = known.triangles(new_cells, known.sides(parted.opened(new_cells) & ~known.opened(cells)))
     of_copies = np.bincount(new_cells.ravel(), np.repeat(volumes, 8), minlength=len(source)).astype(np.float64)
     share = of_copies / np.bincount(cells.ravel(), np.repeat(volumes, 8), minlength=lattice.n_nodes)[source]
@@ -226,7 +228,6 @@ def cut_lattice(lattice: Lattice, parameters: LatticeParameters, blade: SweptBla
     )  # fmt: skip
     gap = np.zeros(len(nodes := np.unique(faces)))
     distances(np.ascontiguousarray(where[source[nodes]]), *blade.arrays, gap)
-    piece = _pieces(8.0 * volumes, parted)
     return LatticeCut(
         made, _parts(parameters, element_source, part), source, share, element_source, faces, piece, float(gap.max(initial=0.0))
     )
@@ -264,13 +265,23 @@ def _without_splinters(known: CubeFaces, cut: BoolArray, passed: BoolArray, volu
     return cut
 
 
-def _separated(cells: IntArray, known: CubeFaces, parted: CubeFaces, cut: BoolArray, n_nodes: int) -> tuple[IntArray, IntArray]:
-    """Return cubes whose nodes are duplicated along cut faces, and of every node the old one that it stands for.
+def _of_more_pieces(cells: IntArray, before: IntArray, piece: IntArray, n_nodes: int) -> BoolArray:
+    """Whether the cubes around each node (n,) are of more pieces than before: such as touch at an edge, and were joined elsewhere."""
+
+    def count(label: IntArray) -> IntArray:
+        pairs = np.unique(cells * (int(label.max()) + 1) + label[:, None])
+        return np.bincount(pairs // (int(label.max()) + 1), minlength=n_nodes)
+
+    return np.asarray(count(piece) > count(before))
+
+
+def _separated(cells: IntArray, known: CubeFaces, parted: CubeFaces, cut: BoolArray, apart: BoolArray) -> tuple[IntArray, IntArray]:
+    """Return cubes whose nodes are duplicated along cut faces, or are `apart` (n,), and of every node the old one that it stands for.
 
     A node on the face of a larger cube, which has it not as a corner, is held by that cube too: cubes around the node that faces of the
     larger one join are joined.
     """
-    touched = np.zeros(n_nodes, dtype=bool)
+    touched, n_nodes = apart.copy(), len(apart)
     small, large = known.pairs[cut].T
     touched[cells[small[:, None], FACES[known.face[cut]]]] = True
     touched[cells[large[:, None], FACES[known.unit[cut] % 6]]] = True

@@ -37,7 +37,7 @@ def path_file(folder: Path, lowest: float, text: str = "") -> Path:
 
 def test_a_notch_opens_when_the_body_is_pulled_apart(tmp_path: Path) -> None:
     done = cut(mesh_file(tmp_path), path_file(tmp_path, 10.0), out=tmp_path / "out", pull_percent=10.0)
-    assert [file.name for file in done.files] == ["cut.html", "cut.vtu", "cut.vtkhdf", "cut.json"]
+    assert [file.name for file in done.files] == ["cut.html", "cut.vtu", "cut-surface.vtu", "cut.vtkhdf", "cut.json"]
     numbers = json.loads((tmp_path / "out" / "cut.json").read_text())
     assert numbers["pieces"] == 1
     assert numbers["pulled_along"] == "x"
@@ -126,6 +126,13 @@ def test_a_lattice_is_cut_in_the_frame_of_its_scan(tmp_path: Path) -> None:
     assert numbers["pulled_along"] == "y"
     assert numbers["area_of_the_cut_mm2"] == pytest.approx(64.0)
     assert done.opening_mm == pytest.approx(1.6, rel=0.02)
+    meshio = pytest.importorskip("meshio")
+    surface = meshio.read(tmp_path / "out" / "cut-surface.vtu")
+    a, b, c = surface.points[surface.cells_dict["triangle"]].transpose(1, 0, 2)
+    np.testing.assert_array_equal(np.bincount(surface.cell_data_dict["piece"]["triangle"].astype(int)), [32, 32])
+    normals = 0.5 * np.cross(b - a, c - a)
+    np.testing.assert_allclose(surface.points[:, 1], 108.0, atol=1e-4)  # both sides, which look at each other
+    np.testing.assert_allclose([normals.sum(axis=0), np.abs(normals).sum(axis=0)], [[0.0] * 3, [0.0, 128.0, 0.0]], atol=1e-3)
     written = read_mesh(tmp_path / "out" / "cut.vtu")
     np.testing.assert_allclose(written.points.min(axis=0), [-4.0, 100.0, 0.0], atol=1e-4)
     assert signed_volumes(written).sum() == pytest.approx(1024.0, rel=1e-6)

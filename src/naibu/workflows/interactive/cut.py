@@ -38,7 +38,7 @@ from naibu.workflows.interactive.touchable_models import MeshMaterial, Touchable
 from naibu.workflows.markers.experiments import Source
 from naibu.workflows.results.output_folder import folder_of_results
 
-FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
+FILES = ("cut.html", "cut.vtu", "cut-surface.vtu", "cut.vtkhdf", "cut.json")
 FRAME_S = 1.0 / 60.0
 PULL_FRAMES, REST_FRAMES = 30, 30
 PAGE_BYTES = 8_000_000
@@ -94,7 +94,8 @@ def cut(
     path : path-like
         Table of the blade's edge, in the frame of the mesh or the scan; see `naibu.io.tables.blade_table.read_blade_path`.
     out : path-like
-        Folder for ``cut.html``, ``cut.vtu`` (mesh with pieces), ``cut.vtkhdf`` (motion) and ``cut.json``.
+        Folder for ``cut.html``, ``cut.vtu`` (mesh with pieces), ``cut-surface.vtu`` (faces of the cut), ``cut.vtkhdf`` (motion) and
+        ``cut.json``.
     distance_mm : float, optional
         Twice the largest distance of the cut from the blade, mm; by default half of the mean edge of a mesh. Lattices are not refined: a
         cut of theirs farther away is refused.
@@ -278,6 +279,12 @@ def _written(
     on_cut = np.zeros(found.mesh.n_points)
     on_cut[found.faces.ravel()] = 1.0
     write_vtu(folder / "cut.vtu", found.mesh, {"cut": on_cut, "displacement": moved[-1]}, {"piece": found.piece, "parent": found.parents})
+    nodes, triangles = np.unique(found.faces, return_inverse=True)
+    none = np.zeros(len(found.faces), dtype=np.int64)  # the only region
+    surface = Mesh(found.mesh.points[nodes], triangles.reshape(-1, 3), "triangle", none, ("cut",))
+    of_node = np.zeros(found.mesh.n_points, dtype=np.int64)
+    of_node[found.mesh.cells] = found.piece[:, None]
+    write_vtu(folder / "cut-surface.vtu", surface, {"displacement": moved[-1][nodes]}, {"piece": of_node[found.faces[:, 0]]})
     write_vtkhdf_series(folder / "cut.vtkhdf", found.mesh, times, {"displacement": moved})
     write_atomically(folder / "cut.json", json.dumps(dict(numbers), indent=1) + "\n")
     text = motion_html(_page(model, faces, found, numbers, times, moved), PAGE_BYTES)
