@@ -330,10 +330,11 @@ def collected(
     strain_sd = np.sqrt(strain_variance(fit, c, samples, bias) + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2)
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
+    of_strain, of_bias, of_place, of_bending = (per_cell(system.grid, fit, values) for values in (strain_sd, biased, misplaced, bending))
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
-        *(per_cell(system.grid, fit, values) for values in (strain_sd, biased, misplaced, bending)), dilatation,
-        fit.residual_sd, maps[0], maps[1], converged, inclusions, motions, _status(system.grid, volume, converged),
+        of_strain, of_bias, of_place, of_bending, dilatation, fit.residual_sd,
+        maps[0], maps[1], converged, inclusions, motions, _status(system.grid, volume, converged),
     )  # fmt: skip
 
 
