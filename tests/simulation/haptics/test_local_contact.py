@@ -111,6 +111,18 @@ def test_the_force_is_that_of_a_body_that_takes_steps_of_a_millisecond() -> None
     assert np.abs(found - expected).max() < 0.1 * expected.max()
 
 
+def test_a_tool_that_turns_back_does_not_feel_a_stiffer_body() -> None:
+    """A spring whose force is known to 1 %: the way of the step in which the tool turns back is small, and tells no stiffness."""
+    led, _ = beside(LossyChannel(loss=0.0, late=0.0))
+    spring, depth = 200.0, np.concatenate([np.arange(1.0, 5.0, 0.25), [4.71], np.arange(4.5, 4.0, -0.25)])
+    for k, d in enumerate(depth):
+        force = spring * d * (1.0 - 0.01 * (d == 4.71))
+        frame = replace(led.body.last, number=k, tool="sphere", tool_centre=np.array([0.0, 0.0, -d]), force=np.array([0.0, 0.0, -force]))
+        led.contact.observe(frame, led=True)
+        assert k < 2 or led.contact._new.stiffness < 1.05 * spring
+    assert led.contact._new.stiffness > 0.9 * spring
+
+
 @pytest.mark.parametrize("seed", [1, 2])
 def test_lost_and_late_packets_and_frames_make_no_step_and_no_energy(seed: int) -> None:
     def stirring(t: float) -> FloatArray:

@@ -4,7 +4,8 @@ After a step the reaction of the body is known where the tool was in it. Until t
 tool, with the stiffness that the last steps showed, and only as long as the tool pushes: the intermediate representation of
 :cite:t:`adachi1995`, for deformable bodies that of :cite:t:`barbagli2003`. The tool goes its way a thousand times a second, and the
 body follows it step by step. Where a new step contradicts the model, the reaction goes over to it in the time of a step. The stiffness
-is that of a step, inertia included, and the largest of the last while: too much makes the tool slow, too little lets it bounce.
+is that of a step, inertia included, and the largest of the last while: too much makes the tool slow, too little lets it bounce. Steps
+end a little out of balance, so that one in which the force hardly changes says little of the stiffness.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from naibu.simulation.tool_places import placed
 STIFFEST = 2e4  # mN/mm, of the continuation
 MEMORY_S = 0.25  # in which a stiffness that a step showed is forgotten: too much makes the tool slow, too little makes it bounce
 LEAST_MOTION_MM = 0.03  # along the push, from which a step shows a stiffness
+DOUBT = 0.03  # of the push: by a change below it, as where the tool turns back, a step may keep a stiffness but not raise it
 ELSEWHERE_S = 0.25  # a tool farther off than it goes in this time was put there by someone else
 
 Order = Callable[[InteractiveSimulation], None]
@@ -183,8 +185,9 @@ class LocalContact:
             direction = frame.force / push
             moved = float((place - before.place) @ direction)
             if abs(moved) > LEAST_MOTION_MM:
-                shown = (push - max(before.push, 0.0) * float(before.direction @ direction)) / moved
-                stiffness = max(stiffness, min(shown, STIFFEST))
+                change = push - max(before.push, 0.0) * float(before.direction @ direction)
+                most = before.stiffness if abs(change) < DOUBT * push and before.stiffness > 0.0 else STIFFEST
+                stiffness = max(stiffness, min(change / moved, most))
         elif stiffness > 0.0:
             surface = frame.positions[np.unique(frame.body.faces)]
             push = -stiffness * max(float(placed(tool, place, frame.tool_rotation).gap(surface).min()), 0.0)
