@@ -362,3 +362,22 @@ def test_what_cannot_be_cut_is_refused() -> None:
     lost[3] = np.nan
     with pytest.raises(InputError, match="1 of 125 nodes are not finite"):
         cut_volume(mesh, plane(), 2.0, positions=lost)
+
+
+@pytest.mark.parametrize("touching", ["edge", "node"])
+def test_pieces_that_touched_elsewhere_do_not_hang_on_an_edge_or_a_node(touching: str) -> None:
+    """A chain of cubes whose ends touch at a mere edge or node, as meshes from label volumes do: parted in the middle, they come free."""
+    chains = {
+        "edge": [(1, 1, 0), (0, 1, 0), (0, 2, 0), (0, 3, 0), (1, 3, 0), (2, 3, 0), (2, 2, 0)],
+        "node": [(1, 1, 0), (0, 1, 0), (0, 2, 0), (0, 3, 0), (0, 3, 1), (1, 3, 1), (2, 3, 1), (2, 2, 1)],
+    }
+    whole = box((40.0, 40.0, 20.0), (4, 4, 2), cell_type="tetra")
+    place = np.floor((whole.points[whole.cells].mean(axis=1) - whole.points.min(axis=0)) / 10.0).astype(int)
+    kept = whole.cells[np.isin(place @ [16, 4, 1], np.array(chains[touching]) @ [16, 4, 1])]
+    used, cells = np.unique(kept, return_inverse=True)
+    chain = Mesh.from_arrays(whole.points[used], cells.reshape(kept.shape), "tetra")
+    x, y = whole.points.min(axis=0)[:2] + np.array([-6.0, 24.7])  # through the third cube
+    blade = swept_blade(np.stack([[[x + v, y, -5.0], [x + v, y, 25.0]] for v in np.linspace(0.0, 19.0, 5)]))
+    cut = cut_volume(chain, blade, 4.0)
+    assert cut.n_pieces == 2
+    check(chain, cut, 4.0)

@@ -200,9 +200,9 @@ def _root(parent, i):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True)
 def corner_groups(cells, leaves, count, faces, touched, slot):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Group the corners at the vertices of open faces by the faces that still join their cells.
+    """Group the corners at the vertices of open faces, and at those `touched` before, by the faces that still join their cells.
 
-    `touched` (vertices) and `slot` (cells) are filled with 0 and -1 before. Returns the cells at these vertices, the group (4 of every
+    `touched` (vertices) is 0 at others, and `slot` (cells) -1 before. Returns the cells at these vertices, the group (4 of every
     cell) of each corner, which is -1 at other vertices, and the number of groups beyond the first of each vertex.
     """
     for f in range(len(faces)):

@@ -3,9 +3,10 @@
 Two neighbours are separated where the segment between their centres crosses the surface. Cells beside such faces are bisected first, until
 the faces lie within half of a given distance of the surface; so are cells in which the surface parts the centre from a vertex that is on no
 such face and farther from it, so that slices which are thinner than a cell are cut off. Around every vertex of these faces, cells that are
-joined by other faces keep one vertex; each other group of cells gets a copy. So no cell hangs on another by a mere edge or vertex, a cut
-may end inside the body, where the vertices of its front have one group, and cuts may cross. The forest is kept: leaves keep number, parent,
-level and tag, so that it can be refined and coarsened further; bisections that the cut runs through are not undone any more.
+joined by other faces keep one vertex; each other group of cells gets a copy, and so around vertices elsewhere whose cells a cut parts in
+more pieces. So no piece hangs on another by a mere edge or vertex, a cut may end inside the body, where the vertices of its front have one
+group, and cuts may cross. The forest is kept: leaves keep number, parent, level and tag, so that it can be refined and coarsened further;
+bisections that the cut runs through are not undone any more.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from naibu.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, require_positive, require_shape
+from naibu.core.arrays import AnyArray, BoolArray, FloatArray, Int8Array, IntArray, require_positive, require_shape
 from naibu.core.errors import InputError
 from naibu.meshing.cutting import _separation_kernels as kernels
 from naibu.meshing.cutting._crossing_kernels import distances
@@ -156,8 +157,9 @@ def _cut(
     if len(whole.triangles) > len(blade.triangles):  # where cells are new, what the blade swept before has told already
         late = late[~fresh[late[:, ::2]].any(axis=1)]
     most = SPLINTER if len(whole.triangles) == len(blade.triangles) else OF_STEP
+    whole_pieces = _labels(forest)
     faces = _opened(forest, np.concatenate([faces, late]), centres, whole, 0.5 * distance_mm, most)
-    copies = _separated(forest, faces)
+    copies = _separated(forest, faces, _of_more_pieces(forest, *whole_pieces))
     apart = _apart(forest, faces)
     kernels.set_open(forest.arrays[0], faces[~apart], 0)
     forest.cut_front, forest.since_cut = _corners(forest, faces[~apart, 0], faces[~apart, 1]), np.zeros(0, dtype=bool)
@@ -178,12 +180,32 @@ def _extended(values: AnyArray, rows: int, copies: IntArray) -> AnyArray:
 
 def forest_pieces(forest: BisectionForest) -> IntArray:
     """Return the number of the piece of every leaf (n_cells,), in the order of `BisectionForest.leaf_mesh`, the largest volume first."""
-    label = np.full(forest.cell_rows, -1, dtype=np.int64)
-    count = int(kernels.components(forest.arrays[0], forest.arrays[4], forest.n_cells, label, np.empty(forest.n_cells, dtype=np.int64)))
+    label, count = _labels(forest)
     cells = np.sort(forest.leaves())
     rank = np.empty(count, dtype=np.int64)
     rank[np.argsort(-np.bincount(label[cells], forest.volumes(cells)), kind="stable")] = np.arange(count)
     return np.asarray(rank[label[cells]])
+
+
+def _labels(forest: BisectionForest) -> tuple[IntArray, int]:
+    """Return which of the parts that faces join each leaf belongs to (cell_rows,), -1 at other cells, and how many there are."""
+    label = np.full(forest.cell_rows, -1, dtype=np.int64)
+    count = kernels.components(forest.arrays[0], forest.arrays[4], forest.n_cells, label, np.empty(forest.n_cells, dtype=np.int64))
+    return label, int(count)
+
+
+def _of_more_pieces(forest: BisectionForest, before: IntArray, n_before: int) -> Int8Array:
+    """Whether cells around each vertex (node_rows,) are of more pieces than before: such as touch at an edge, and were joined elsewhere."""
+    label, count = _labels(forest)
+    if count == n_before:
+        return np.zeros(forest.node_rows, dtype=np.int8)
+    leaves = forest.leaves()
+    corners = forest.simplices[leaves].astype(np.int64)
+
+    def pieces_around(of: IntArray, most: int) -> IntArray:
+        return np.bincount(np.unique(corners * most + of[leaves, None]) // most, minlength=forest.node_rows)
+
+    return (pieces_around(label, count) > pieces_around(before, n_before)).astype(np.int8)
 
 
 def _crossed(forest: BisectionForest, surface: KernelBlade, where: FloatArray, centres: FloatArray) -> IntArray:
@@ -265,9 +287,9 @@ def face_vertices(forest: BisectionForest, cells: IntArray, places: IntArray) ->
     return corners
 
 
-def _separated(forest: BisectionForest, faces: IntArray) -> IntArray:
-    """Double the vertices of open faces, and return them with their copies (k, 2)."""
-    touched, slot = np.zeros(forest.node_rows, dtype=np.int8), np.full(forest.cell_rows, -1, dtype=np.int64)
+def _separated(forest: BisectionForest, faces: IntArray, touched: Int8Array) -> IntArray:
+    """Double the vertices of open faces, and those `touched` (node_rows,), and return them with their copies (k, 2)."""
+    slot = np.full(forest.cell_rows, -1, dtype=np.int64)
     around, group, count = kernels.corner_groups(forest.arrays[0], forest.arrays[4], forest.n_cells, faces, touched, slot)
     first, source = forest.node_rows, np.empty(int(count), dtype=np.int64)
     forest.reserve(int(count))
