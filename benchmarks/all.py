@@ -24,6 +24,8 @@ COMMANDS: dict[str, tuple[str | None, str]] = {
     "fe_compression": ("fe_compression.py --cells 8 --repeats 1 --peers naibu,felupe,scikit-fem", "fe_compression.py"),
     "fe_gradient": ("fe_gradient.py --cells 8 --repeats 1 --peers naibu", "fe_gradient.py --cells 40"),
     "lattice_steps": ("lattice_steps.py --sizes 8 --repeats 3", "lattice_steps.py"),
+    "lattice_gpu": (None, "lattice_gpu.py --record"),
+    "fe_gpu": (None, "fe_gpu.py --record"),
     "rheology_speed": (None, "rheology_speed.py"),
     "accuracy": (None, "accuracy.py --record"),
     "interval_coverage": (None, "interval_coverage.py 16 --record"),

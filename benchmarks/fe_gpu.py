@@ -159,6 +159,11 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--record", action="store_true")
     asked = parser.parse_args()
+    on_gpu = asked.device.startswith("cuda")
+    if on_gpu and not import_module("warp").is_cuda_available():
+        parser.error("there is no CUDA device; --device cpu tries the program without one")
+    if asked.record and not on_gpu:
+        parser.error("--record keeps times of a GPU: use --device cuda:0")
     packages = [PACKAGES[name](asked.device) for name in asked.packages.split(",")]
     rows: list[tuple[str | float | int, ...]] = []
     for cells in (int(text) for text in asked.cells.split(",")):

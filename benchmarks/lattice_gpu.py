@@ -143,6 +143,8 @@ def main() -> None:
     cards = [f"{d.alias} {d.name}" for d in warp.get_cuda_devices()]
     print("CUDA devices: " + (", ".join(cards) or "none. What follows is Warp on the processor and says nothing about a GPU."))
     device = asked.device or ("cuda:0" if cards else "cpu")
+    if asked.record and not device.startswith("cuda"):
+        parser.error("--record keeps times of a GPU, and there is no CUDA device")
     cores = f"{os.cpu_count()} cores, Numba threads {numba.get_num_threads()}"
     print(f"Warp {warp.__version__}, {cores}, load {os.getloadavg()[0]:.1f} at the start")
     for n in (int(size) for size in asked.sizes.split(",")):
