@@ -32,6 +32,7 @@ from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 from naibu.mechanics.lattices.model.surface import surface_faces
 from naibu.meshing.cutting._crossing_kernels import crossed_segments, distances
+from naibu.meshing.cutting.pieces import of_more_pieces
 from naibu.meshing.cutting.swept_blade import SweptBlade
 
 SPLINTER = 8  # finest cubes, less than which do not come loose merely because the face of a larger cube is cut as a whole
@@ -212,7 +213,7 @@ def cut_lattice(lattice: Lattice, parameters: LatticeParameters, blade: SweptBla
     cut = _crossed(where[cells].mean(axis=1), known, blade, volumes)
     parted = replace(known, joined=known.joined & ~cut)
     piece = _pieces(8.0 * volumes, parted)
-    apart = _of_more_pieces(cells, _pieces(8.0 * volumes, known), piece, lattice.n_nodes)
+    apart = of_more_pieces(cells, _pieces(8.0 * volumes, known), piece, lattice.n_nodes)
     new_cells, source = _separated(cells, known, parted, cut, apart)
     faces = known.triangles(new_cells, known.sides(parted.opened(new_cells) & ~known.opened(cells)))
     of_copies = np.bincount(new_cells.ravel(), np.repeat(volumes, 8), minlength=len(source)).astype(np.float64)
@@ -263,16 +264,6 @@ def _without_splinters(known: CubeFaces, cut: BoolArray, passed: BoolArray, volu
             area = np.bincount(other[whole], known.edge[known.pairs[whole, 0]].astype(np.float64) ** 2)
             cut &= ~(whole & (other == int(area.argmax())))
     return cut
-
-
-def _of_more_pieces(cells: IntArray, before: IntArray, piece: IntArray, n_nodes: int) -> BoolArray:
-    """Whether the cubes around each node (n,) are of more pieces than before: such as touch at an edge, and were joined elsewhere."""
-
-    def count(label: IntArray) -> IntArray:
-        pairs = np.unique(cells * (int(label.max()) + 1) + label[:, None])
-        return np.bincount(pairs // (int(label.max()) + 1), minlength=n_nodes)
-
-    return np.asarray(count(piece) > count(before))
 
 
 def _separated(cells: IntArray, known: CubeFaces, parted: CubeFaces, cut: BoolArray, apart: BoolArray) -> tuple[IntArray, IntArray]:

@@ -21,6 +21,7 @@ from naibu.core.errors import InputError
 from naibu.meshing.cutting import _separation_kernels as kernels
 from naibu.meshing.cutting._crossing_kernels import distances
 from naibu.meshing.cutting.earlier_fronts import bridges, fronts_near
+from naibu.meshing.cutting.pieces import of_more_pieces
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.quality import smallest_dihedral_angle
 from naibu.meshing.refinement._forest_kernels import COUNT, FLIPPED, LEAF, NODES
@@ -195,17 +196,13 @@ def _labels(forest: BisectionForest) -> tuple[IntArray, int]:
 
 
 def _of_more_pieces(forest: BisectionForest, before: IntArray, n_before: int) -> Int8Array:
-    """Whether cells around each vertex (node_rows,) are of more pieces than before: such as touch at an edge, and were joined elsewhere."""
+    """Whether the leaves around each vertex (node_rows,) are of more pieces than before; see `pieces`."""
     label, count = _labels(forest)
     if count == n_before:
         return np.zeros(forest.node_rows, dtype=np.int8)
     leaves = forest.leaves()
     corners = forest.simplices[leaves].astype(np.int64)
-
-    def pieces_around(of: IntArray, most: int) -> IntArray:
-        return np.bincount(np.unique(corners * most + of[leaves, None]) // most, minlength=forest.node_rows)
-
-    return (pieces_around(label, count) > pieces_around(before, n_before)).astype(np.int8)
+    return of_more_pieces(corners, before[leaves], label[leaves], forest.node_rows).astype(np.int8)
 
 
 def _crossed(forest: BisectionForest, surface: KernelBlade, where: FloatArray, centres: FloatArray) -> IntArray:
