@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import label
 
 from naibu.core.errors import ConvergenceError, InputError
+from naibu.mechanics.lattices.cpu import engine as engine_module
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.coefficients import implicit_coefficients
@@ -307,6 +308,15 @@ def test_threads_and_precision_change_nothing_but_the_last_digits():
     for other, digits in zip(runs[1:], (1e-12, 1e-12, 3e-5), strict=True):
         np.testing.assert_allclose(other.state.position, runs[0].state.position, atol=digits * 10.0)
         np.testing.assert_allclose(other.reaction, runs[0].reaction, atol=digits * np.abs(runs[0].reaction).max() * 10.0)
+
+
+def test_a_large_lattice_takes_some_of_many_cores_and_a_small_one_takes_one(monkeypatch):
+    monkeypatch.setattr(engine_module.numba, "get_num_threads", lambda: 16)
+    for cells, expected in ((15, engine_module.MOST_THREADS), (3, 1)):
+        lattice = classic_lattice(box_mask((cells,) * 3), 5.0, total_mass_kg=0.6)
+        parameters = lattice_parameters(lattice, 10.0, 0.01, 0.02)
+        assert LatticeEngine.of(lattice, parameters, step=1e-4).threads == expected
+        assert LatticeEngine.of(lattice, parameters, step=1e-4, threads=9).threads == 9
 
 
 def test_explicit_steps_blow_up_beyond_their_limit_and_say_so():

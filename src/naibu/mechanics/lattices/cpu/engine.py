@@ -39,6 +39,7 @@ from naibu.mechanics.lattices.model.state import (
 )
 
 THREADED_FROM = 20_000  # elements; below, one thread is faster than two that wait for each other
+MOST_THREADS = 4  # by default; on 16 cores, 8 and 16 threads took 2.5 and 3.5 times as long as 4 (benchmarks/lattice_gpu.py, 65^3 nodes)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,7 +108,7 @@ class LatticeEngine:
         tolerance : float
             Of the implicit solver: 0.01 changes displacements by some 1e-5, forces by 2e-5 of their size. Stability does not depend on it.
         threads : int
-            Of a step; by default those of Numba from 20 000 elements, else one. Results depend on them by rounding.
+            Of a step; by default those of Numba, four at most, from 20 000 elements, else one. Results depend on them by rounding.
 
         Raises
         ------
@@ -119,7 +120,7 @@ class LatticeEngine:
         kind = np.float32 if precision == "single" else np.float64
         blocks = Blocks.of(lattice)
         if threads is None:
-            threads = numba.get_num_threads() if lattice.n_elements >= THREADED_FROM else 1
+            threads = min(numba.get_num_threads(), MOST_THREADS) if lattice.n_elements >= THREADED_FROM else 1
         pad = -(-lattice.n_nodes // WIDTH) * WIDTH + WIDTH
         mass = aligned((pad,), kind)
         mass[: lattice.n_nodes] = lattice.node_mass
