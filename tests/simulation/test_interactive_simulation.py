@@ -328,6 +328,34 @@ def test_a_nearly_incompressible_body_goes_on_in_real_time_behind_a_cut() -> Non
     assert np.abs(frame.positions - before).max() < 0.1  # mm: the weight above keeps the cut closed
 
 
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+def test_a_cut_at_once_goes_on_as_one_that_was_prepared(friction: float) -> None:
+    """Volume strains and the sides of the cut are in balance behind both, so that no step needs Newton's method."""
+    size, n, motions = 60.0, 7, []
+    mesh = box((size,) * 3, (n,) * 3, cell_type="tetra")
+    law = material(young_modulus=70.0, poisson_ratio=0.499)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    whole = FiniteElementBody.of(
+        mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), gravity=(0.0, 0.0, -9810.0), background=False
+    )
+    for prepared in (False, True):
+        touched = InteractiveSimulation(replace(whole, lips_friction=friction), {})
+        for _ in range(20):
+            touched.advance()
+        blade = [[[x, -0.6 * size, 26.0], [x, 0.6 * size, 22.0]] for x in (-0.6 * size, 0.6 * size)]
+        if prepared:
+            touched.begin_cut(blade)
+            assert touched.finish_cut(wait=True)
+        else:
+            assert touched.cut(blade).n_pieces == 2  # type: ignore[union-attr]
+        frames = [touched.advance() for _ in range(5)]
+        session = touched._session
+        assert isinstance(session, RealTimeSession)
+        assert session.newton_steps == 0 and not any(frame.failed for frame in frames)
+        motions.append([frame.positions for frame in frames])
+    np.testing.assert_array_equal(*motions)
+
+
 def test_a_lattice_is_cut_while_it_is_touched() -> None:
     touched = simulation()
     before = touched.body.engine.lattice  # type: ignore[attr-defined]

@@ -1,10 +1,11 @@
-"""A cut that a thread prepares, with the factors of the body behind it, while the body goes on moving."""
+"""Cuts of finite elements with the balance and the factors of the body behind them, prepared at once or by a thread as the body goes on."""
 
 from __future__ import annotations
 
 import threading
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +16,8 @@ from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.cutting.volume import VolumeCut
-from naibu.simulation.interactive_bodies import FiniteElementBody
+from naibu.simulation.interactive_bodies import AnySession, FiniteElementBody, InteractiveBody
+from naibu.simulation.lattice_cut import LatticeCut
 
 CUT_STAGES = ("separating the mesh", "bringing volume strains to balance", "factorizing the stiffness", "lifting the tool")
 PART = 0.1  # of a step, in which volume strains come to balance
@@ -68,17 +70,57 @@ class BackgroundCut:
         if self._thread is not None:
             self._thread.join()
 
+    def prepare(self, state: DynamicState, blade: SweptBlade, distance_mm: float | None) -> VolumeCut:
+        """Do at once what the thread of `begin` does, and return the cut.
+
+        Raises
+        ------
+        InputError
+            What `naibu.meshing.cut_volume` refuses.
+        """
+        body, behind, found = self.body.cut(state, blade, distance_mm)
+        self.stage = 1
+        settled = _settled(body, behind)
+        self.stage = 2
+        _keep_tangent(body, settled)
+        self._made = body, found, settled - behind.displacement
+        return found
+
     def _run(self, state: DynamicState, blade: SweptBlade, distance_mm: float | None) -> None:
         try:
-            body, behind, found = self.body.cut(state, blade, distance_mm)
-            self.stage = 1
-            settled = _settled(body, behind)
-            self.stage = 2
-            _keep_tangent(body, settled)
-            self._made = body, found, settled - behind.displacement
+            self.prepare(state, blade, distance_mm)
         except BaseException as error:
             self._failure = error
         self.stage = len(CUT_STAGES) - 1
+
+
+def cut_in_balance(
+    body: InteractiveBody, session: AnySession, blade: SweptBlade, distance_mm: float | None
+) -> tuple[InteractiveBody, Any, VolumeCut | LatticeCut]:
+    """Return the body of a session and its state behind a cut, where finite elements are in balance, and their tangent is at hand.
+
+    Parameters
+    ----------
+    body : InteractiveBody
+        What is cut.
+    session : session of the body
+        With its state as the blade passes.
+    blade : SweptBlade
+        The surface that it sweeps.
+    distance_mm : float, optional
+        See `FiniteElementBody.cut`.
+
+    Raises
+    ------
+    InputError
+        What the body's own `cut` refuses.
+    """
+    state = body.without_contact(session.state())
+    if not isinstance(body, FiniteElementBody):
+        return body.cut(state, blade, distance_mm)
+    cutting = BackgroundCut(body)
+    found = cutting.prepare(state, blade, distance_mm)
+    return *cutting.result(state), found
 
 
 def _settled(body: FiniteElementBody, behind: DynamicState) -> FloatArray:

@@ -22,7 +22,7 @@ from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
-from naibu.simulation.background_cut import BackgroundCut
+from naibu.simulation.background_cut import BackgroundCut, cut_in_balance
 from naibu.simulation.frame import Frame
 from naibu.simulation.held_tool import HeldTool, outside_planes
 from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
@@ -222,7 +222,7 @@ class InteractiveSimulation:
         self._last = self._frame(self._last.number + 1, 0.0, np.zeros(3), np.zeros(3), "")
 
     def cut(self, edges: ArrayLike, distance_mm: float | None = None) -> VolumeCut | LatticeCut:
-        """Cut the body along the surface between successive positions of a blade's edge.
+        """Cut the body along the surface between successive positions of a blade's edge; finite elements come to balance behind it.
 
         Parameters
         ----------
@@ -236,7 +236,7 @@ class InteractiveSimulation:
         InputError
             What `swept_blade`, `naibu.meshing.cut_volume` and `naibu.simulation.cut_lattice` refuse; the body is then as it was.
         """
-        body, state, found = self.body.cut(self.body.without_contact(self._session.state()), swept_blade(edges), distance_mm)
+        body, state, found = cut_in_balance(self.body, self._session, swept_blade(edges), distance_mm)
         self._keep()
         self._go_on(body, state)
         return found
