@@ -87,6 +87,31 @@ def test_a_cut_along_the_end_of_another_meets_it() -> None:
     np.testing.assert_allclose(sizes(twice)[:3], expected, atol=1.01 * SIZE**2)  # half of the distance over a section
 
 
+def test_a_cut_across_the_very_end_of_another_meets_it_or_it_is_said_that_it_does_not() -> None:
+    """In any direction the two part what lies beside and before them, or the place where it hangs together is told."""
+    met = 0
+    for seed in range(24):
+        rng = np.random.default_rng(3000 + seed)
+        along, across, way = np.linalg.qr(rng.normal(size=(3, 3)))[0].T
+        centre, distance = np.array([0.0, 0.0, 10.0]) + rng.uniform(-2.0, 2.0, 3), float(rng.choice([2.0, 3.0]))
+        end, through = (
+            swept_blade([[centre - 40.0 * along + s * to, centre + 40.0 * along + s * to] for s in np.linspace(-40.0, last, 4)])
+            for to, last in ((way, 0.0), (across, 40.0))
+        )
+        once = cut_volume(cubes(seed), end, distance)
+        twice = cut_volume(once.mesh, through, distance)
+        assert twice.deviation_mm <= 0.5 * distance
+        assert signed_volumes(twice.mesh).sum() == pytest.approx(SIZE**3, rel=1e-12)
+        middle = twice.mesh.points[twice.mesh.cells].mean(axis=1) - centre
+        beside = np.abs(middle @ across) > distance
+        behind, over = middle @ way < -distance, middle @ across > 0.0
+        above, below = (set(twice.piece[beside & behind & half]) for half in (over, ~over))
+        parted = not above & below
+        assert parted != (len(twice.bridges) > 0), seed
+        met += parted
+    assert met >= 23
+
+
 def test_fronts_are_the_edges_at_which_a_cut_ends() -> None:
     assert not len(front_edges(BisectionForest.of(cubes(1)))[0])
     cut = cut_volume(box((SIZE, SIZE, SIZE), (4, 4, 4), cell_type="tetra"), _upright(0.0, -15.0, 0.1), 10.0)  # along faces of the mesh

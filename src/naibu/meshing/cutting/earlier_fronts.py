@@ -7,6 +7,7 @@ would leave a ligament thinner than a cell, whose sides hang together.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,7 @@ AHEAD = 0.7  # cosine of the angle between the way to the blade and the directio
 BESIDE = 1  # rows of edges beside those that are met, which are so too: fronts are jagged
 FOLDED = 1e-8  # 1 - cosine of the angle between the two faces of a front
 AROUND = 2.0  # longest edges: radius in which the cut parts the cells around a front where it goes on from it
-LEAST_PART = 0.05  # of the volume of these, on one side
+MOST = 0.5  # of the area of the earlier cut within that radius
 PARTS = 4  # of an edge of a front, which a rim that is bent between its ends is followed with
 
 
@@ -38,8 +39,6 @@ class EarlierFronts:
         Vertices of fronts that are nearer to the blade than most of a cell.
     cell_mm : ndarray, shape (k,)
         Longest edge of the cells around each of them.
-    sides : ndarray, shape (k,), int64
-        How many parts the cells around should be in behind the cut: 2 where it goes on, 3 where it crosses the end of the earlier one.
     way : SweptBlade or None
         The surface straight to the blade from those fronts near which it begins or ends, and from those that would run into it.
     joined_mm : float
@@ -48,16 +47,13 @@ class EarlierFronts:
 
     vertices: IntArray
     cell_mm: FloatArray
-    sides: IntArray
     way: SweptBlade | None
     joined_mm: float
 
 
 def front_edges(forest: BisectionForest) -> tuple[IntArray, IntArray]:
     """Return the edges (e, 2), by vertices, at which cuts of a forest end inside it, and a vertex (e,) of a face behind each."""
-    cells, places = forest.boundary_faces()[0].T
-    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-    faces = forest.simplices[cells].astype(np.int64)[np.arange(len(cells))[:, None], others[places]]
+    faces = _face_vertices(forest, forest.boundary_faces()[0])
     edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     apex = faces[:, [2, 0, 1]].ravel()
     order = np.lexsort((edges[:, 1], edges[:, 0]))
@@ -79,7 +75,7 @@ def fronts_near(forest: BisectionForest, blade: SweptBlade, where: FloatArray) -
     edges, behind = front_edges(forest)
     vertices = np.unique(edges)
     if not len(vertices):
-        return EarlierFronts(vertices, np.empty(0), vertices, None, 0.0)
+        return EarlierFronts(vertices, np.empty(0), None, 0.0)
     gap, longest = np.empty(len(vertices)), _longest_edge(forest, vertices, where)
     distances(np.ascontiguousarray(where[vertices]), *blade.arrays, gap)
     near = gap <= REACH * longest
@@ -87,57 +83,101 @@ def fronts_near(forest: BisectionForest, blade: SweptBlade, where: FloatArray) -
     known = np.isin(edges, vertices).all(axis=1)
     edges, behind = edges[known], behind[known]
     if not len(edges):
-        return EarlierFronts(vertices, longest, np.full(len(vertices), 2), None, 0.0)
+        return EarlierFronts(vertices, longest, None, 0.0)
     low, high = where[vertices].min(axis=0) - longest.max(), where[vertices].max(axis=0) + longest.max()
     triangles, rim = (_within(part, low, high) for part in (blade.points[blade.triangles], _rim(blade)))
     at_rim = np.linalg.norm(_nearest(rim, where[vertices]) - where[vertices], axis=1) <= longest
-    ahead = np.unique(edges[_ahead(triangles, where[edges], where[behind])])
-    met = np.union1d(vertices[at_rim], ahead)
+    ahead = _ahead(triangles, where[edges], where[behind], AROUND * longest.max())
+    met = np.union1d(vertices[at_rim], edges[ahead])
     for _ in range(BESIDE):
         met = np.union1d(met, edges[np.isin(edges, met).any(axis=1)])
     chosen = edges[np.isin(edges, met).any(axis=1)]
     ends = _lengthened(forest, chosen, where, vertices, REACH * longest)
     return EarlierFronts(
-        vertices, longest, np.where(np.isin(vertices, ahead) & ~at_rim, 3, 2), _way(triangles, np.concatenate([where[chosen], ends])),
+        vertices, longest, _way(triangles, np.concatenate([where[chosen], ends])),
         float(np.linalg.norm(where[chosen[:, 1]] - where[chosen[:, 0]], axis=1).sum()),
     )  # fmt: skip
 
 
-def bridges(forest: BisectionForest, fronts: EarlierFronts) -> IntArray:
+def bridges(forest: BisectionForest, fronts: EarlierFronts, faces: IntArray) -> IntArray:
     """Return the vertices (b,) of earlier fronts near a blade at which the body still hangs together between them and the cut made now.
 
-    Near them there are fronts still, and the cells around hold together by faces. Where the cut parts those, the front is that of a spur:
-    as cuts of one blade may differ by the distance that they keep from it, so may an earlier one branch off the new one.
+    Near them there are fronts still, and the cells around join most of what the earlier cut had parted. Where they do not, the front is
+    that of a spur: as cuts of one blade may differ by the distance that they keep from it, so may an earlier one branch off the new one, or
+    go through it by a little.
+
+    Parameters
+    ----------
+    forest : BisectionForest
+        Behind the cut.
+    fronts : EarlierFronts
+        Of before the cut.
+    faces : ndarray, shape (f, 4), int64
+        Cell and place of the faces of the cut, on both sides.
     """
     left = forest.points[np.unique(front_edges(forest)[0])] if len(fronts.vertices) else np.empty((0, 3))
     if not len(left):
         return fronts.vertices[:0]
     closed = cKDTree(left).query(forest.points[fronts.vertices])[0] <= fronts.cell_mm
-    vertices = fronts.vertices[closed]
+    vertices, radius = fronts.vertices[closed], AROUND * fronts.cell_mm[closed]
     leaves = forest.leaves()
-    tree = cKDTree(forest.points[forest.simplices[leaves]].mean(axis=1))
-    around = tree.query_ball_point(forest.points[vertices], AROUND * fronts.cell_mm[closed])
-    parts = np.array([_parts(forest, leaves[places]) for places in around], dtype=np.int64)
-    return vertices[parts < fronts.sides[closed]]
+    around = cKDTree(forest.points[forest.simplices[leaves]].mean(axis=1)).query_ball_point(forest.points[vertices], radius)
+    lips, middle, area = _earlier_lips(forest, faces, cKDTree(forest.points[vertices]), radius.max(initial=0.0))
+    beside = cKDTree(middle).query_ball_point(forest.points[vertices], radius)
+    joined = [_joined(forest, leaves[cells], lips[rows], area[rows]) for cells, rows in zip(around, beside, strict=True)]
+    return np.asarray(vertices[np.array(joined, dtype=bool)])
 
 
-def _parts(forest: BisectionForest, cells: IntArray) -> int:
-    """Number of groups, slivers aside, of cells (c,) that faces among them join."""
+def _earlier_lips(forest: BisectionForest, faces: IntArray, near: cKDTree, radius: float) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Pairs of cells (p, 2) on both sides of cuts but the last one, of faces (f, 4), and the middles and areas of the smaller faces."""
+    boundary = forest.boundary_faces()[0]
+    new = np.concatenate([faces[:, :2], faces[:, 2:]]) @ [4, 1]
+    boundary = boundary[~np.isin(boundary @ [4, 1], new)]
+    corners = forest.points[_face_vertices(forest, boundary)]
+    close = near.query(corners.mean(axis=1))[0] <= radius
+    boundary, corners = boundary[close], corners[close]
+    middle, normal = corners.mean(axis=1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
+    area = np.linalg.norm(normal, axis=1)
+    around = cKDTree(middle).query_ball_point(middle, size)
+    one = np.repeat(np.arange(len(middle)), [len(found) for found in around])
+    two = np.fromiter(itertools.chain.from_iterable(around), dtype=np.int64)
+    # the middle of the smaller face, `two`, lies in the larger one: bisection keeps them nested
+    kept = (one != two) & (area[two] <= (1.0 + FOLDED) * area[one])
+    one, two = one[kept], two[kept]
+    a, b, c = corners[one].transpose(1, 0, 2)
+    share = np.stack([(np.cross(q - p, middle[two] - p) * normal[one]).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))])
+    apart = np.abs(((middle[two] - a) * normal[one]).sum(axis=1)) / area[one]
+    lie = (share >= 0.0).all(axis=0) & (apart <= FOLDED * size[one])
+    one, two = one[lie], two[lie]
+    return np.stack([boundary[one, 0], boundary[two, 0]], axis=1), middle[two], area[two]
+
+
+def _joined(forest: BisectionForest, cells: IntArray, lips: IntArray, area: FloatArray) -> bool:
+    """Whether faces among cells (c,) join most of the pairs of cells (p, 2), by areas (p,)."""
     cells = np.sort(cells)
     across = forest.neighbours[cells].astype(np.int64)
     place = np.minimum(np.searchsorted(cells, across), len(cells) - 1)
     one, corner = np.nonzero(cells[place] == across)
     two = place[one, corner]
     graph = sp.coo_matrix((np.ones(len(one), dtype=np.int8), (one, two)), shape=(len(cells), len(cells)))
-    volumes = np.bincount(connected_components(graph, directed=False)[1], forest.volumes(cells))
-    return int((volumes > LEAST_PART * volumes.sum()).sum())
+    label = connected_components(graph, directed=False)[1]
+    ends = np.minimum(np.searchsorted(cells, lips), len(cells) - 1)
+    known = (cells[ends] == lips).all(axis=1)
+    same = label[ends[known, 0]] == label[ends[known, 1]]
+    return bool(area[known][same].sum() > MOST * area[known].sum())
 
 
-def _ahead(blade: FloatArray, edges: FloatArray, behind: FloatArray) -> BoolArray:
-    """Whether the nearest points of triangles (t, 3, 3) lie ahead of fronts (e, 2, 3), whose faces end at points (e, 3) behind them."""
+def _ahead(blade: FloatArray, edges: FloatArray, behind: FloatArray, radius: float) -> BoolArray:
+    """Whether the nearest points of triangles (t, 3, 3) lie ahead of fronts (e, 2, 3), whose faces end at points (e, 3) behind them.
+
+    Where an earlier cut would go on is the mean over fronts within a radius: single faces lean to all sides.
+    """
     middle, along = edges.mean(axis=1), _unit(edges[:, 1] - edges[:, 0])
     back = behind - middle
     back = _unit(back - (back * along).sum(axis=1)[:, None] * along)
+    around = cKDTree(middle).query_ball_point(middle, radius)
+    back = _unit(np.stack([back[rows][back[rows] @ own > 0.0].sum(axis=0) for own, rows in zip(back, around, strict=True)]))
     return np.asarray((_unit(_nearest(blade, middle) - middle) * back).sum(axis=1) < -AHEAD)
 
 
@@ -206,6 +246,12 @@ def _longest_edge(forest: BisectionForest, vertices: IntArray, where: FloatArray
     out = np.zeros(forest.node_rows)
     np.maximum.at(out, corners.ravel(), np.repeat(longest, 4))
     return np.asarray(out[vertices])
+
+
+def _face_vertices(forest: BisectionForest, faces: IntArray) -> IntArray:
+    """Vertices (f, 3) of faces (f, 2), cell and place, in any order."""
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+    return np.asarray(forest.simplices[faces[:, 0]].astype(np.int64)[np.arange(len(faces))[:, None], others[faces[:, 1]]])
 
 
 def _unit(vectors: FloatArray) -> FloatArray:

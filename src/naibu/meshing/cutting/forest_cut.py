@@ -125,7 +125,7 @@ def cut_forest(
     on = blade if fronts is None or fronts.way is None else blade + fronts.way
     try:
         found = _cut(forest, on, on if earlier is None else on + earlier, distance_mm, where, least_angle_deg)
-        return found if fronts is None else replace(found, joined_mm=fronts.joined_mm, bridges=bridges(forest, fronts))
+        return found if fronts is None else replace(found, joined_mm=fronts.joined_mm, bridges=bridges(forest, fronts, found.faces))
     except BaseException:
         forest.become(before)
         raise
