@@ -241,6 +241,25 @@ def test_sides_of_a_cut_rub_in_real_time_as_newtons_method_has_it_and_always_dis
     assert ratio[60] > 0.25 and ratio[-1] < -0.25 and np.abs(ratio[20:]).max() < 0.3  # the pieces yield at the rim, where less presses
 
 
+def test_many_pairs_that_turn_round_at_once_are_balanced_in_real_time() -> None:
+    """180 pairs, pressed on and sheared to and fro by constrained nodes: no step needs Newton's method, which takes seconds."""
+    mesh, friction = inclined(0.0, n=9), 0.3
+    made = problem(mesh, (0.0, 0.0, 0.0), friction).assembler
+    engine, _ = stepped_by(RealTimeEngine, made, mesh, 1.0 / 60.0)
+    low, high = (np.flatnonzero(side) for side in (mesh.points[:, 2] < 1e-9, mesh.points[:, 2] > SIZE - 1e-9))
+    with engine.session(constrained=[low, high]) as session:
+        for along, down in [(0.0, -4.0)] * 5 + [(12.0, 0.0)] * 7 + [(-12.0, 0.0)] * 14:
+            before = session.state()
+            force = session.step([[0.0, 0.0, 0.0], [along, 0.0, down]]).bodies[0, 1]
+        assert session.newton_steps == 0
+        stepped = engine.assembler.in_step(before.displacement, before.lips)
+        assert isinstance(stepped, LipAssembler) and stepped.lips is not None and len(stepped.lips.pairs) == 180
+        across, traction = stepped.lips.slip_forces(session.state().displacement)
+    slides = np.linalg.norm(traction, axis=1) > friction * across * (1.0 - 1e-9)
+    assert slides[across > 0.0].mean() > 0.9  # at the rim some do not press
+    assert -force[0] == pytest.approx(-friction * force[2], rel=0.03)
+
+
 def test_in_real_time_the_force_on_a_steep_cut_is_that_of_a_sliding_wedge() -> None:
     friction, slope = 0.2, 0.4
     forces, _ = rubbed(RealTimeEngine, friction, slope, [(0.0, -0.5)] * 20)  # slowly, by a quarter of a per cent

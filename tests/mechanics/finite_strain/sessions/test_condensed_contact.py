@@ -135,8 +135,30 @@ def test_springs_stop_at_a_wall_or_do_not_reach_it(begin: float) -> None:
     stopped = (BODY * 2.0 + WALL * GAP) / (BODY + WALL)
     np.testing.assert_allclose(force[:, 2], [-BODY * (2.0 - stopped), 0.0, 0.0], atol=0.2)
     np.testing.assert_allclose(force[:, :2], 0.0, atol=1e-6)
-    assert condensed.serves(tangent, np.array([2, 3]))
-    assert not condensed.serves(tangent, np.array([1, 2]))
+    none = np.zeros(0, np.int64)
+    assert condensed.serves(tangent, np.array([2, 3]), none)
+    assert not condensed.serves(tangent, np.array([1, 2]), none)
+    assert not condensed.serves(tangent, np.array([2, 3]), np.array([1]))
+
+
+def test_gripped_nodes_stay_and_the_others_move_as_those_of_a_body_that_is_held_there() -> None:
+    """A chain before a wall with two nodes held fast, and its dense matrix without their rows and columns."""
+    count, held = 8, np.array([2, 6])
+    springs = BODY * (2.2 * np.eye(count) - np.eye(count, k=1) - np.eye(count, k=-1))
+    body, moving = np.kron(springs, np.eye(3)), np.setdiff1d(np.arange(count), held)
+    load = np.column_stack([np.linspace(-3.0, 3.0, count), np.ones(count), 4.0 + 6.0 * np.cos(np.arange(count))])
+    whole = np.linalg.solve(body, load.ravel()).reshape(-1, 3)
+    condensed = CondensedContact(factorized(body), moving, np.full(len(moving), BODY), held)
+    alone = condensed.held(whole[moving], whole[held])
+    at = (3 * moving[:, None] + np.arange(3)).ravel()
+    np.testing.assert_allclose(alone.ravel(), np.linalg.solve(body[np.ix_(at, at)], load[moving].ravel()), atol=1e-5)
+    force = np.zeros((count, 3))
+    force[moving] = found_by(condensed.forces(alone, Wall(), np.zeros_like(alone), 1e-6, 10.0, 1e-3))
+    force[held] = condensed.holding(whole[held], force[moving])
+    reached = whole + np.linalg.solve(body, force.ravel()).reshape(-1, 3)
+    np.testing.assert_allclose(reached[held], 0.0, atol=1e-5)
+    assert force[moving, 2].min() < -0.1
+    np.testing.assert_allclose(force[moving, 2], -WALL * np.maximum(reached[moving, 2] - GAP, 0.0), atol=0.02 * np.abs(force).max())
 
 
 def test_springs_beside_a_change_hold_the_nodes_back() -> None:

@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+import scipy.linalg as la
 from numpy.typing import NDArray
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
@@ -72,22 +73,44 @@ class CondensedContact:
         Their numbers in the body.
     stiffness : ndarray, shape (k,)
         Of the elements at the nodes, mN/mm.
+    gripped : ndarray, shape (g,), int64
+        Other nodes, which do not move.
     """
 
     tangent: EarlierTangent
     nodes: IntArray
     stiffness: FloatArray
+    gripped: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    _carried: NDArray[np.float32] = field(init=False)  # forces on gripped nodes (3 g, 3 k) from forces on the others, negative
+    _holding: tuple[FloatArray, NDArray[np.int32]] = field(init=False)
     _inverse: NDArray[np.float32] = field(init=False)
     _changed: ChangedInverse | None = field(init=False, default=None)
     _springs: FloatArray = field(init=False)  # that hold the nodes back (k,), mN/mm
 
     def __post_init__(self) -> None:
-        self._inverse = self.tangent.factors.between(self.nodes)
-        self._springs = np.zeros(len(self.nodes))
+        self._springs, free = np.zeros(len(self.nodes)), 3 * len(self.nodes)
+        whole = self.tangent.factors.between(np.concatenate([self.nodes, self.gripped]))
+        self._inverse, self._carried = whole, np.zeros((0, free), dtype=np.float32)
+        if len(self.gripped):
+            self._holding = la.lu_factor(whole[free:, free:].astype(np.float64), check_finite=False)
+            self._carried = np.asarray(la.lu_solve(self._holding, whole[free:, :free], check_finite=False), dtype=np.float32)
+            self._inverse = np.asfortranarray(whole[:free, :free] - whole[:free, free:] @ self._carried)
 
-    def serves(self, tangent: EarlierTangent, nodes: IntArray) -> bool:
-        """Whether these nodes (l,) are among those of the same body."""
-        return tangent is self.tangent and bool(np.isin(nodes, self.nodes, assume_unique=True).all())
+    def serves(self, tangent: EarlierTangent, nodes: IntArray, gripped: IntArray) -> bool:
+        """Whether these nodes (l,) are among those of the same body, of which the same ones are gripped."""
+        same = tangent is self.tangent and np.array_equal(gripped, self.gripped)
+        return same and bool(np.isin(nodes, self.nodes, assume_unique=True).all())
+
+    def held(self, free: FloatArray, gripped: FloatArray) -> FloatArray:
+        """Return the motion of the nodes (k, 3), mm, if the gripped ones are held, from those (k, 3) and (g, 3) without grip."""
+        return free - (gripped.ravel() @ self._carried).reshape(-1, 3)
+
+    def holding(self, gripped: FloatArray, force: FloatArray) -> FloatArray:
+        """Return what holds the gripped nodes (g, 3), mN, from their motion (g, 3) without grip and the forces on the others (k, 3)."""
+        if len(gripped) == 0:
+            return gripped
+        still = la.lu_solve(self._holding, gripped.ravel(), check_finite=False)
+        return np.asarray(-(still + self._carried @ force.ravel().astype(np.float32)).reshape(-1, 3))
 
     def forces(
         self,
@@ -98,6 +121,7 @@ class CondensedContact:
         longest_mm: float,
         faint_mn: float,
         most: int = CHANGES,
+        unaided: int = UNAIDED,
     ) -> Generator[None, None, FloatArray]:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.
 
@@ -119,6 +143,8 @@ class CondensedContact:
             Forces so small, mN, that it does not matter by how much they are wrong.
         most : int
             Matrices at most.
+        unaided : int
+            Of them before nodes are held back.
         """
         at = best = begun = self._tried(begin, begin, free, law)
         evaluations, changes, steps, mixing = 1, 0, 0, AndersonMixing(DEPTH)
@@ -130,7 +156,7 @@ class CondensedContact:
                 if changes == most or self._consistent(at, begin, law, ENOUGH, faint_mn):
                     break
                 yield
-                if changes == UNAIDED and not self._springs.any() and len(held := law.opened().nodes):
+                if changes == unaided and not self._springs.any() and len(held := law.opened().nodes):
                     self._springs[held] = self.stiffness[held]
                     at = best = self._tried(begin, begin, free, law)
                 change = law.change().with_springs(self._springs)
@@ -189,7 +215,7 @@ class _Motion:
 
 @dataclass(slots=True, eq=False)
 class ContactBesideTangent:
-    """Forces of contacts and grips beside those that an earlier tangent contains: a `ContactLaw`.
+    """Forces of contacts beside those that an earlier tangent contains: a `ContactLaw`.
 
     Attributes
     ----------
@@ -205,10 +231,6 @@ class ContactBesideTangent:
         Of the surface.
     tangent : EarlierTangent
         With its contacts.
-    gripped : ndarray, shape (g,), int64
-        Nodes among them that stay where they are.
-    hold : float
-        Stiffness that represents this, mN/mm.
     """
 
     nodes: IntArray
@@ -217,8 +239,6 @@ class ContactBesideTangent:
     places: Sequence[Int32Array]
     pattern: BlockPattern
     tangent: EarlierTangent
-    gripped: IntArray
-    hold: float
     _place: IntArray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -231,7 +251,6 @@ class ContactBesideTangent:
         moved[self.nodes] += motion
         pattern = self.pattern
         add_earlier_forces(pattern.indptr, pattern.indices, self.tangent.contact, self.nodes, self._place, motion, force)
-        force[self.gripped] -= self.hold * (moved - self.displacement)[self.gripped]
         for contact in self.contacts:
             contact.add_force(moved, force)
         return np.asarray(force[self.nodes])
@@ -248,4 +267,4 @@ class ContactBesideTangent:
         return self._beside(np.zeros((self.pattern.n_blocks, 3, 3)))
 
     def _beside(self, blocks: FloatArray) -> BlockChange:
-        return contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place, self.gripped, self.hold)
+        return contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place)

@@ -155,9 +155,9 @@ class SolverPool:
 
 
 def contact_change(
-    pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTangent, nodes: IntArray, place: IntArray, gripped: IntArray, hold: float
+    pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTangent, nodes: IntArray, place: IntArray
 ) -> BlockChange:
-    """Return where, and by how much, the stiffness of contacts and grips differs from that of a tangent, mN/mm.
+    """Return where, and by how much, the stiffness of contacts differs from that of a tangent, mN/mm.
 
     Parameters
     ----------
@@ -171,24 +171,13 @@ def contact_change(
         The nodes concerned, of which the change is sought.
     place : ndarray, shape (n,), int64
         Of every node among them, or -1.
-    gripped : ndarray, shape (g,), int64
-        Nodes that move as they are told, beside those that the tangent holds.
-    hold : float
-        Stiffness that represents this, mN/mm.
     """
     count, at, rows, columns = _changed_blocks(pattern.indptr, pattern.indices, blocks, tangent.contact, nodes, place, THRESHOLD)
     at, rows, columns = at[:count], rows[:count], columns[:count]
-    own = place[gripped]
-    own = own[own >= 0]
     marked = np.zeros(len(nodes), dtype=bool)
-    for some in (rows, columns, own):
-        marked[some] = True
+    marked[rows] = marked[columns] = True
     number = np.cumsum(marked) - 1
-    return BlockChange(
-        np.flatnonzero(marked).astype(np.int64), np.concatenate([number[rows], number[own]]),
-        np.concatenate([number[columns], number[own]]),
-        np.concatenate([blocks[at] - tangent.contact[at], np.tile(hold * np.eye(3), (len(own), 1, 1))]),
-    )  # fmt: skip
+    return BlockChange(np.flatnonzero(marked).astype(np.int64), number[rows], number[columns], blocks[at] - tangent.contact[at])
 
 
 @njit(cache=True, nogil=True)

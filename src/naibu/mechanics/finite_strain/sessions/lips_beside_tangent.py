@@ -2,7 +2,8 @@
 
 A tangent of then holds closed what was closed then. Pairs whose state has changed since, or may change, are taken out of it, and their
 contact is solved as it is, condensed to their nodes like that of indenters (`naibu.mechanics.finite_strain.sessions.condensed_contact`).
-Friction has the stiffness of its secant in both, which is symmetric.
+Friction has the stiffness of its secant in both, which is symmetric. Where it acts, all pairs that press or are near to it are taken out:
+what the others leave out of balance where the motion turns round takes iterations of the whole body, and at last Newton's method.
 """
 
 from __future__ import annotations
@@ -11,14 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
-from naibu.mechanics.contact.cut_lips import TANGENTIAL, CutLips, pair_forces
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact.cut_lips import CutLips, pair_forces
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
-MOST = 80  # pairs in a step
-AHEAD = 40  # pairs for which the inverse is prepared
-OTHERWISE = 0.3  # of the stiffness of a pair that sticks: change of that of friction from which a pair is taken out
+MOST = 80  # pairs in a step, without friction
+AHEAD = 40  # pairs for which the inverse is prepared, likewise
 NEAR = 0.1  # of the edge: gaps, and penetrations, from which pairs are not expected to change
 
 
@@ -104,25 +104,17 @@ def changing_lips(lips: CutLips, tangent: EarlierTangent, displacement: FloatArr
     then = tangent.lips.any(axis=(1, 2))
     known = tangent.factors.covered(lips.pairs).all(axis=1)
     changed = (then != (before < 0.0)) | (known & (then != (after < 0.0)))
-    if lips.friction > 0.0:
-        changed |= _rubs_otherwise(lips, tangent, displacement) | (known & _rubs_otherwise(lips, tangent, displacement + free))
     close = np.minimum(np.abs(before), np.abs(after)) / lips.edge
+    if lips.friction > 0.0:
+        chosen = np.flatnonzero(changed | then | (close < NEAR)).astype(np.int64)
+        return LipsBesideTangent(lips.only(chosen), chosen, displacement, tangent.lips[chosen])
     chosen = np.flatnonzero(changed | (known & (close < NEAR)))
     chosen = np.sort(chosen[np.lexsort((close[chosen], ~changed[chosen]))][:MOST]).astype(np.int64)
     return LipsBesideTangent(lips.only(chosen), chosen, displacement, tangent.lips[chosen])
 
 
-def _rubs_otherwise(lips: CutLips, tangent: EarlierTangent, displacement: FloatArray) -> BoolArray:
-    """Return which pairs (p,) resist slip at a displacement otherwise than in a tangent."""
-    now = lips.add(displacement, np.zeros_like(displacement), secant=True)[1]
-    assert lips.normals is not None
-    change = now - tangent.lips
-    along = np.trace(change, axis1=1, axis2=2) - np.einsum("pi,pij,pj->p", lips.normals, change, lips.normals)
-    return np.asarray(np.abs(along) > 2.0 * OTHERWISE * TANGENTIAL * lips.stiffness * lips.area)
-
-
 def lips_about_to_change(lips: CutLips, displacement: FloatArray) -> IntArray:
     """Return the nodes (k,) of the pairs whose sides are nearest to opening or closing at a displacement (n, 3), mm, the nearest first."""
     near = np.abs(lips.gaps(displacement)) / lips.edge
-    order = np.argsort(near, kind="stable")[:AHEAD]
+    order = np.argsort(near, kind="stable")[: AHEAD if lips.friction == 0.0 else None]
     return np.asarray(lips.pairs[order[near[order] < NEAR]].ravel(), dtype=np.int64)

@@ -26,7 +26,7 @@ from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
-from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, CondensedContact, ContactBesideTangent
+from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, UNAIDED, CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
@@ -50,7 +50,7 @@ UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is 
 SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 STIFFEST = 16.0  # times the first penalty, to which penalties rise: stiffer ones need more iterations
-RUBBING = 3  # matrices for contacts in an iteration where sides of cuts rub: many stick or slip by turns, and the iterations find them
+RUBBING = 8  # matrices for contacts in an iteration where sides of cuts rub: many pairs stick or slip by turns, and none is held back
 RAISE = 1.3  # of a penalty in a step; where it leaps, pressure and limit of friction do, and the surface slips to another equilibrium
 
 
@@ -359,7 +359,7 @@ class RealTimeSession(TangentSession):
         """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are."""
         balance[self._constrained] = 0.0
         x = -tangent.factors.solve(balance.ravel())
-        free = x.reshape(-1, 3)  # gripped nodes move as well: they are held by the law below
+        free = x.reshape(-1, 3)  # gripped nodes move as well: they are held below
         marked = np.zeros(len(free), dtype=bool)
         marked[tangent.touched] = True
         active = []
@@ -371,18 +371,16 @@ class RealTimeSession(TangentSession):
         for concerned in (*(c.contact.nodes for c in active), *(c.lips.pairs for c in lips)):
             marked[concerned] = True
         gripped = np.concatenate([*self.bodies[1:], np.zeros(0, np.int64)])
-        marked[gripped] = True
-        marked[tangent.held] = False
+        marked[gripped] = marked[tangent.held] = False
         nodes = np.flatnonzero(marked).astype(np.int64)
-        if len(nodes):
+        if len(nodes) or len(gripped):
             condensed = self._condensed
-            if condensed is None or not condensed.serves(tangent, nodes):
-                yield from tangent.factors.prepared(nodes)
-                condensed = self._condensed = CondensedContact(tangent, nodes, self._engine._local_stiffness[nodes])
+            if condensed is None or not condensed.serves(tangent, nodes, gripped):
+                yield from tangent.factors.prepared(np.concatenate([nodes, gripped]))
+                condensed = self._condensed = CondensedContact(tangent, nodes, self._engine._local_stiffness[nodes], gripped)
             nodes = condensed.nodes
-            hold = 1e3 * float(self._engine._elements.bulk.max()) * self.engine._extent
             places = [*self._places, *([self._engine._pairs] if lips else [])]
-            law = ContactBesideTangent(nodes, trial.displacement, [*active, *lips], places, self._engine._surface, tangent, gripped, hold)
+            law = ContactBesideTangent(nodes, trial.displacement, [*active, *lips], places, self._engine._surface, tangent)
             begin = np.zeros_like(free)  # but nodes that indenters touch are carried along by them
             for near, gaps in zip(self._near if first else (), self._gaps, strict=False):
                 carried = near.contact.nodes[gaps[near.points] < 0.0]
@@ -390,9 +388,11 @@ class RealTimeSession(TangentSession):
                 begin[carried] = self.reached.displacement[carried] + way - trial.displacement[carried]
             extent, faint = self.engine._extent, self._engine.faint_mn
             longest = min(0.05 * extent, float(harmless_ways(self.indenters).min(initial=np.inf)))
-            most = RUBBING if self.engine.assembler.unsymmetric else CHANGES
-            force = yield from condensed.forces(free[nodes], law, begin[nodes], 1e-5 * extent, longest, faint, most)
-            tangent.factors.add_columns(nodes, force, x)
+            limits = (RUBBING, RUBBING) if self.engine.assembler.unsymmetric else (CHANGES, UNAIDED)
+            alone = condensed.held(free[nodes], free[gripped])
+            force = yield from condensed.forces(alone, law, begin[nodes], 1e-5 * extent, longest, faint, *limits)
+            holding = condensed.holding(free[gripped], force)
+            tangent.factors.add_columns(np.concatenate([nodes, gripped]), np.concatenate([force, holding]), x)
         free[self._constrained] = 0.0
         return free
 

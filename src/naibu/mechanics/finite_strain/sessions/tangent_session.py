@@ -64,7 +64,8 @@ class TangentSession(DynamicSession):
 
     def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
         engine = self._engine
-        return nodes_ahead(contacts, gaps, engine.faces.shape[1], engine._extent, engine.assembler, self.reached.displacement)
+        ahead = nodes_ahead(contacts, gaps, engine.faces.shape[1], engine._extent, engine.assembler, self.reached.displacement)
+        return np.concatenate([*self.bodies[1:], ahead])
 
     def _current_tangent(self) -> EarlierTangent:
         """Return the tangent of the state nearest to where the body goes; where there is none for these supports, it is made now."""
