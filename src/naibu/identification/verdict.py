@@ -45,7 +45,9 @@ class Verdict:
     outliers : tuple of str
         Points that were left out, one sentence each.
     limits : str
-        What is known only roughly although the model explains the data, in words that follow "but"; empty where nothing is.
+        What is known only roughly or not at all although the model explains the data, in words that follow "but"; empty where nothing is.
+    mesh_dependent : tuple of str
+        Zones whose moduli smaller elements would change by so much that they are not determined, while those of the others are.
     """
 
     explanation: Explanation
@@ -57,6 +59,7 @@ class Verdict:
     notes: tuple[str, ...] = ()
     outliers: tuple[str, ...] = ()
     limits: str = ""
+    mesh_dependent: tuple[str, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -81,6 +84,7 @@ class Verdict:
             "sentence": self.sentence,
             "reasons": list(self.reasons),
             "notes": list(self.notes),
+            "mesh_dependent": list(self.mesh_dependent),
         }
 
 

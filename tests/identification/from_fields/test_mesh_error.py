@@ -9,7 +9,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, logarithms, moduli_of
-from naibu.identification.from_fields.mesh_error import changes_on_finer_mesh
+from naibu.identification.from_fields.mesh_error import at_least_to, carried_over, changes_on_finer_mesh, doubt_in_all
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
@@ -59,3 +59,35 @@ def test_what_half_the_size_changes_is_that_of_an_equilibrium_reached_from_rest(
     there = solve(problem, settings=SolverSettings(first_step=0.05, largest_step=0.1, tolerance=1e-8)).displacement
     expected = (interpolation_operator(fine, points) @ there - interpolation_operator(mesh, points) @ point.states[0]) / 0.1
     np.testing.assert_allclose(found[0][0].reshape(-1, 3), expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_the_others_follow_a_modulus_that_is_wrong_as_the_least_squares_fit_does() -> None:
+    """One column of a regression with a wrong coefficient: the others change by the regression of that column on theirs."""
+    columns = np.random.default_rng(0).normal(size=(50, 3)) @ np.array([[1.0, 0.6, 0.2], [0.0, 1.0, -0.5], [0.0, 0.0, 1.0]])
+    apart = np.array([False, True, False])
+    covariance = carried_over(np.diag([0.0, 0.3**2, 0.0]), columns.T @ columns, apart)
+    follow = -0.3 * np.linalg.lstsq(columns[:, ~apart], columns[:, 1], rcond=None)[0]
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.abs([follow[0], 0.3, follow[1]]), rtol=1e-10)
+    assert np.sign(covariance[0, 1]) == np.sign(follow[0])
+
+
+def test_what_a_zone_set_apart_changes_is_no_doubt_of_others_but_by_what_the_data_tie_them() -> None:
+    """A skin whose ln mu changes by 1 on half the size, and a muscle that is not tied to it: its doubt of 0.5 for thin layers stays."""
+    relative, sure, thin = np.array([0.05, 1.0, 0.02, 0.1]), np.ones(4, dtype=bool), np.array([False, True])
+    tied = np.diag([4e4, 400.0, 100.0, 1.0])
+    alone = doubt_in_all(relative, sure, tied, thin, mixed=True, thin=thin)
+    np.testing.assert_allclose(np.sqrt(np.diag(alone))[[0, 2]], 0.5 / 1.4)
+    tied[0, 1] = tied[1, 0] = 2000.0  # ln mu of the muscle falls by a twentieth of what that of the skin is too high
+    both = doubt_in_all(relative, sure, tied, thin, mixed=True, thin=thin)
+    np.testing.assert_allclose(both[0, 0], alone[0, 0] + 0.05**2 * alone[1, 1])
+    worst = doubt_in_all(relative, sure, tied, np.zeros(2, dtype=bool), mixed=True, thin=thin)
+    assert np.sqrt(worst[0, 0]) == pytest.approx(1.0 / 1.4)
+
+
+def test_one_standard_deviation_of_elements_reaches_what_another_mesh_gives() -> None:
+    """Of ln mu, and of mu / kappa, in which errors are normal: a fifth where it is larger by a fifth elsewhere."""
+    theta, other = np.array([1.0, 2.0]), np.array([1.3, 2.0 - np.log(1.2)])
+    raised = at_least_to(other, theta, np.diag([0.1**2, 0.5**2]))
+    np.testing.assert_allclose(np.sqrt(np.diag(raised)), [0.3, 0.5])
+    assert at_least_to(None, theta, raised) is raised
+    np.testing.assert_allclose(np.sqrt(np.diag(at_least_to(other, theta, np.zeros((2, 2))))), [0.3, 0.2])

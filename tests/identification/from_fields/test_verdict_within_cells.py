@@ -93,3 +93,32 @@ def test_moduli_that_elements_determine_leave_the_verdict_as_it_is() -> None:
     for small in (np.array([0.05, 0.1]), np.full(2, np.nan)):
         assert limited_by_elements(EXPLAINED, NAMES, small, bounds) is EXPLAINED
     assert EXPLAINED.reservation == ""
+
+
+THIN = np.array([False, True])
+
+
+def test_a_thin_zone_that_moves_is_set_apart_and_named_and_the_others_stand() -> None:
+    """Young's modulus of the skin changes 1.9 times; that of the muscle, whose interval holds what the skin may be, by a tenth."""
+    judged = judged_within_cells(EXPLAINED, NAMES, half((10.0, 45.0), (0.45, 0.40)), THIN)
+    assert judged.ok and judged.explanation is Explanation.IN_PART
+    assert judged.mesh_dependent == ("skin",) and judged.to_dict()["mesh_dependent"] == ["skin"]
+    assert judged.sentence.startswith("Explained in part, but elements of this size do not determine skin (with half their size its moduli")
+    assert judged.reservation == judged.sentence and "muscle" not in judged.limits
+
+
+@pytest.mark.parametrize(
+    ("young", "poisson", "sd"),
+    [
+        ((6.0, 26.0), (0.45, 0.485), OPEN),  # the muscle, which is not thin
+        ((6.0, 45.0), (0.45, 0.40), OPEN),  # both
+        ((10.0, 26.0), (0.45, 0.485), (0.8, 0.9, 0.8, 1.5)),  # no Young's modulus is determined
+        ((10.0, 45.0), (0.45, 0.40), (0.8, 0.15, 0.8, 1.5)),  # none but that of the skin
+    ],
+)
+def test_nothing_stands_where_another_zone_moves_or_none_is_determined(
+    young: tuple[float, float], poisson: tuple[float, float], sd: tuple[float, ...]
+) -> None:
+    judged = judged_within_cells(EXPLAINED, NAMES, half(young, poisson, sd), THIN)
+    assert not judged.ok and judged.mesh_dependent == ()
+    assert "use smaller ones" in judged.sentence

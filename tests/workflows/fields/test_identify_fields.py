@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from dataclasses import replace
 from functools import cache
@@ -27,6 +28,7 @@ from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
 from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced, moved_borders, sizes_of_voxels
 from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions
 from naibu.workflows.fields.known_zones import parse_known_zones
+from naibu.workflows.fields.object_on_cubes import ScannedObject
 
 SD_MM = 0.04
 TEXTS = ("identification.json", "model.json", "report.html")
@@ -80,7 +82,7 @@ def test_what_nothing_determines_is_null_in_the_file_of_numbers(folder: Path, mo
     def without_information(*of: Any, **options: Any) -> FieldEstimate:
         return replace(identify_field(*of, **options), uncertainty=Uncertainty.of(np.zeros((2, 2))))
 
-    monkeypatch.setattr(f"{identify_fields.__module__}.identify_field", without_information)
+    monkeypatch.setattr(f"{ScannedObject.__module__}.identify_field", without_information)
     options = {"zones": folder / "labels.mha", "known": ["label 2=10 kPa, 0.4"], "element_size_mm": 10.0, "law": "linear"}
     identify_fields(folder / "field.h5", out=folder / "out", **options)  # type: ignore[arg-type]
     text = (folder / "out" / "identification.json").read_text()
@@ -300,11 +302,35 @@ def test_multiples_of_a_zone_are_nowhere_told_in_kilopascals(folder: Path) -> No
         IdentifiedBody.from_dict(model | {"relative": False})
 
 
-def test_a_map_that_no_regions_explain_says_so_first(folder: Path) -> None:
-    """Noise is stated as a fifth of what it is: what regions leave is beyond it, and the map under the penalty has no intervals."""
+def with_stated_noise(folder: Path, sd_mm: float | None) -> Path:
+    """Return the file of the field with another noise stated, or none."""
     field = read_field(folder / "field.h5")
-    write_field(folder / "sure.h5", DisplacementField.from_arrays(field.points, field.vectors, sd_mm=0.2 * SD_MM))
-    run = identify_fields(folder / "sure.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=10.0)
+    write_field(folder / "stated.h5", DisplacementField.from_arrays(field.points, field.vectors, sd_mm=sd_mm))
+    return folder / "stated.h5"
+
+
+@pytest.mark.parametrize(
+    ("sd_mm", "told", "true"), [(0.2 * SD_MM, r"scatter (\S+) times as much", 5.0), (None, r"measurements scatter by (\S+) mm", SD_MM)]
+)
+def test_noise_that_is_stated_too_small_or_not_at_all_makes_no_structure(folder: Path, sd_mm: float | None, told: str, true: float) -> None:
+    """The map finds one gel, as with the noise stated right; cells of 10 mm do not follow all of the displacement, which counts as well."""
+    options: dict[str, Any] = {"zones": folder / "labels.mha", "known": ["label 2=10 kPa, 0.4"], "law": "linear", "element_size_mm": 10.0}
+    run = identify_fields(with_stated_noise(folder, sd_mm), each_cell=True, **options)
+    right = identify_fields(folder / "field.h5", each_cell=True, **options)
+    found = re.search(told, " ".join(run.cautions))
+    assert found is not None and true < float(found[1]) < 1.3 * true
+    assert run.estimate.zones.count == 1
+    np.testing.assert_allclose(run.estimate.young_modulus, right.estimate.young_modulus, rtol=0.02)
+    assert run.estimate.budget is not None and right.estimate.budget is not None
+    ratio = run.estimate.budget.noise / right.estimate.budget.noise
+    assert (ratio > 0.95).all() and (ratio < 1.4).all()
+
+
+def test_a_map_that_no_regions_explain_says_so_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Noise counts as a fifth of what it is: what regions leave is beyond it, and the map under the penalty has no intervals."""
+    monkeypatch.setattr(f"{ScannedObject.__module__}.with_noise_of_neighbours", lambda _, case: (case, 1.0))
+    with_stated_noise(folder, 0.2 * SD_MM)
+    run = identify_fields(folder / "stated.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=10.0)
     assert run.estimate.uncertainty is None and run.notes[0] == NO_REGIONS
     assert run.unit == "multiples of the median" and "multiples of the median" in run.notes[1]
     volume = np.ones(run.estimate.zones.count)

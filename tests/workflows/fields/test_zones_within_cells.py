@@ -15,9 +15,11 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
+from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import logarithms
 from naibu.identification.from_fields.forward.zones_within_cells import moduli_within_cells, parts_within_cells
+from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.field_prediction import displacement_under_moved_sides, predict_moved_sides
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody, zones_of_cells
 from naibu.identification.from_fields.mesh_error import doubt_of, one_cell_thick
@@ -34,6 +36,8 @@ from naibu.meshing.primitives import box
 from naibu.meshing.surface import side_nodes
 from naibu.workflows.fields.block_mesh import block_mesh, mesh_that_shows, region_in
 from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields
+from naibu.workflows.fields.known_zones import parse_known_zones
+from naibu.workflows.fields.object_on_cubes import ObjectOnCubes, ScannedObject, identified_on_smaller_cubes, smaller_size
 
 SIDE_MM, CELLS, SD_MM = 40.0, 20, 0.02
 TRUTH = {"pad": (10.0, 0.45), "core": (8.0, 0.45), "skin": (3.0, 0.45)}
@@ -192,3 +196,44 @@ def test_cubes_that_do_not_show_a_zone_are_refused_or_made_smaller() -> None:
     mesh, cells = mesh_that_shows(inside, own, names, {"shell"}, 6.0, exactly=False)
     assert 400 < mesh.n_cells < 5000
     assert (mesh.regions[cells[own == 1]] == 0).mean() >= 0.75 and (own[mesh.regions[cells] == 0] == 1).mean() >= 0.75
+
+
+def scanned_limb() -> ScannedObject:
+    """Return the limb with noise of 0.02 mm at 2500 points."""
+    mesh, u = limb()
+    rng = np.random.default_rng(3)
+    points = rng.uniform(0.5, SIDE_MM - 0.5, (2500, 3))
+    moved = interpolation_operator(mesh, points) @ u + SD_MM * rng.standard_normal(points.shape)
+    numbers = labels().values.astype(np.int64)
+    inside = labels().with_values(np.ones(numbers.shape, dtype=np.uint8))
+    return ScannedObject(inside, numbers, NAMES, (("push", DisplacementField.from_arrays(points, moved, sd_mm=SD_MM)),), ())
+
+
+def identified_again(cubes: ObjectOnCubes, most: int) -> tuple[FieldEstimate, ObjectOnCubes, FieldEstimate, list[str]]:
+    """Return moduli on cubes and what at most so many smaller ones make of them, with what was reported on the way."""
+    stated, bounds, told = parse_known_zones(["pad=10 kPa, 0.45"], list(NAMES.values())), Bounds(shear_modulus=(1e-3, 1e5)), list[str]()
+    found = cubes.identified(stated, law="neo_hookean", bounds=bounds, each_cell=False, progress=None)
+    smaller, again = identified_on_smaller_cubes(
+        cubes, found, stated, most=most, law="neo_hookean", bounds=bounds, progress=lambda report: told.append(report.stage)
+    )
+    return found, smaller, again, told
+
+
+def test_moduli_that_cubes_limit_are_identified_again_on_smaller_ones() -> None:
+    """Of 8 mm, wider than the skin; then of 5 mm. The intervals hold the truth and what the larger ones gave, and are narrower."""
+    found, smaller, again, told = identified_again(scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False), 520)
+    assert found.limited_by_mesh and 400 < smaller.mesh.n_cells < 700
+    assert any(line.startswith("the size of cubes limits what is known of moduli: again with cubes of 5 mm") for line in told)
+    within, before = again.intervals()[0], found.intervals()[0]
+    for (low, high), young, name in zip(within, found.young_modulus, ("core", "skin"), strict=True):
+        assert low < TRUTH[name][0] < high and low < young < high
+    assert (within[:, 1] / within[:, 0] < before[:, 1] / before[:, 0]).all()
+
+
+def test_cubes_stay_where_they_limit_nothing_or_can_hardly_be_smaller() -> None:
+    cubes = scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False)
+    found, smaller, again, told = identified_again(cubes, 150)  # of 125
+    assert smaller is cubes and again is found and told == []
+    assert smaller_size(SIDE_MM**3, cubes.mesh, 10**6) == pytest.approx(4.0)  # half as large at once
+    assert smaller_size(SIDE_MM**3, cubes.mesh, 8 * 27) == pytest.approx(SIDE_MM / 6.0)
+    assert smaller_size(SIDE_MM**3, cubes.mesh, 150) is None

@@ -47,14 +47,16 @@ from naibu.identification.from_fields.gauss_newton import (
 )
 from naibu.identification.from_fields.mesh_error import (
     COARSE,
+    at_least_to,
     changes_on_finer_mesh,
-    doubt_of,
+    doubt_in_all,
     extrapolated,
     one_cell_thick,
     refitted,
     relative_change,
     stretch_of,
 )
+from naibu.identification.from_fields.prior_bias import bias_of_prior
 from naibu.identification.from_fields.regions.border_refinement import (
     MOST_REGIONS,
     CorrectedRegions,
@@ -97,6 +99,7 @@ def identify_field(
     elements: FieldElements = "accurate",
     region_at: RegionAt | None = None,
     borders: Sequence[MovedBorder] = (),
+    other_mesh: FloatArray | None = None,
     progress: Progress | None = None,
 ) -> FieldEstimate:
     """Find the moduli of zones from displacement fields measured in one or more load cases, no force being known.
@@ -131,6 +134,8 @@ def identify_field(
         of cells, what this changes is found on the mesh of half the element size, and corrected for. Maps do not use it.
     borders : sequence of MovedBorder
         Where borders of regions may lie as well; becomes part of the intervals, each by itself.
+    other_mesh : ndarray, shape (2 count,), optional
+        ln mu, then ln(kappa / mu) of the zones as found on another mesh: what elements leave in doubt is at least by how much these differ.
     progress : callable, optional
         Gets a report after every step, its stage in words (`naibu.core.progress`); the same words are in `FieldEstimate.steps`.
 
@@ -149,7 +154,7 @@ def identify_field(
     of_map: FieldElements = "as_given" if name is not None and mesh.cell_type == "tetra" else elements
     model = FieldModel(mesh, load_cases, zones, law, of_map)
     within = region_at if name is None else None
-    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, within, tuple(borders))
+    recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, within, tuple(borders), other_mesh)
     point = recipe.start(start)
     return recipe.free(point) if name is None else recipe.regularized(point, name, weight, segmented)
 
@@ -167,6 +172,7 @@ class _Recipe:
     progress: Progress | None
     region_at: RegionAt | None
     borders: tuple[MovedBorder, ...]
+    other_mesh: FloatArray | None
 
     def record(self, text: str, objective: float | None = None) -> None:
         """Keep a step in words, and report it."""
@@ -368,35 +374,38 @@ class _Recipe:
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders))
         on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
-        others = assumptions(at, quadratic, self.law, stretch, self.borders)
-        of_known = covariance_of(others, len(theta))
-        of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
+        of_known = covariance_of(others := assumptions(at, quadratic, self.law, stretch, self.borders), len(theta))
+        judged, names = verdict(model.observed, residuals, freedom), model.zones.names
         thin = () if self.region_at is None or corrected is not None else one_cell_thick(model.mesh)
-        if shift is not None:
-            relative = shift if corrected is not None else relative_change(shift)
-            if corrected is None:
-                mixed, sure = self.region_at is not None, on_mesh.standard_deviations() < DETERMINED
-                of_mesh, covariance = doubt_of(relative, mixed=mixed, thin=np.isin(model.zones.names, thin) if thin else None, sure=sure)
-            else:
-                of_mesh, covariance = corrected.doubt
-            of_mesh, total = of_mesh * stretch, total.with_added(covariance * np.outer(stretch, stretch))
-            coarse = bool(thin) or float(np.abs(relative[sure]).max(initial=0.0)) > COARSE if corrected is None else not corrected.converged
-        total = total.with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
-        judged = verdict(model.observed, residuals, freedom)
         if self.region_at is not None and shift is not None:
             half = HalfSize(point.theta, theta, on_mesh, beyond_noise=(point.misfit - freedom, misfit - freedom))
-            judged = judged_within_cells(judged, model.zones.names, half)
+            judged = judged_within_cells(judged, names, half, np.isin(names, thin))
+        of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
         if shift is not None:
-            by_elements = replace(of_noise, covariance=covariance * np.outer(stretch, stretch)).of_young_and_poisson(theta)[0]
-            judged = limited_by_elements(judged, model.zones.names, by_elements, intervals(theta, total)[0])
+            sure = on_mesh.standard_deviations() < DETERMINED
+            if corrected is None:
+                layers, apart = np.isin(names, thin) if thin else None, np.isin(names, judged.mesh_dependent)
+                change, mixed = relative_change(shift), self.region_at is not None
+                covariance = doubt_in_all(change, sure, quadratic.hessian, apart, mixed=mixed, thin=layers)
+                coarse = bool(thin) or float(np.abs(change[sure]).max(initial=0.0)) > COARSE
+            else:
+                covariance, coarse = corrected.doubt, not corrected.converged
+            covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
+            of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
+        bias, left = bias_of_prior(at, quadratic)
+        total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
+        theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
+        if shift is not None:
+            by_elements = replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
+            judged = limited_by_elements(judged, names, by_elements, intervals(theta, total)[0])
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         limits = (TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1])) if coarse else ()
         words = statement(judged, model.zones, theta, total, others, limits=limits, budget=budget)
         states = tuple(u[: model.mesh.n_points] for u in point.states)
+        borders, parts = (None, None) if refined is None else (refined.borders, refined.parts)
         return FieldEstimate(
             model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,
-            judged, budget, shift, others, None if refined is None else refined.borders,
-            None if refined is None else refined.parts,
+            judged, budget, shift, others, borders, parts,
         )  # fmt: skip
 
     def _doubt_at_bounds(self, theta: FloatArray) -> FloatArray:

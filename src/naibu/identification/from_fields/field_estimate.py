@@ -17,6 +17,7 @@ from naibu.identification.from_fields.regions.borders import Borders
 from naibu.identification.from_fields.regions.segmentation import Segmentation
 from naibu.identification.from_fields.regularization_weight import WeightChoice
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals
+from naibu.identification.from_fields.verdict_within_cells import DETERMINED, ROUGHLY
 from naibu.identification.verdict import Verdict
 
 
@@ -112,6 +113,15 @@ class FieldEstimate:
         if self.uncertainty is None:
             raise InputError("a field of many moduli under a penalty has no intervals; see its `resolution`, or use regions")
         return intervals(self.theta, self.uncertainty, level)
+
+    @property
+    def limited_by_mesh(self) -> bool:
+        """Whether the size of elements leaves more in doubt of a shear modulus that the measurement determines than that does."""
+        if self.budget is None or self.uncertainty is None:
+            return False
+        k = self.zones.count
+        noise, mesh = self.budget.noise[:k], self.budget.mesh[:k]
+        return bool(((mesh > np.maximum(noise, ROUGHLY)) & (noise < DETERMINED)).any())
 
     @property
     def noise_factor(self) -> float:

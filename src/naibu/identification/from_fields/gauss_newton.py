@@ -99,19 +99,42 @@ class SearchSettings:
         Gauss-Newton iterations.
     tolerance : float
         The search ends when a step promises to lower the objective by less than this fraction of it.
+    settled, nearly : float
+        It also ends when moduli would move by fewer standard deviations than `settled`, and the objective would fall by a smaller part than
+        `nearly`: surfaces of nearly incompressible bodies go on to move by what no modulus follows.
     """
 
     max_iterations: int = 30
     tolerance: float = 1e-7
+    settled: float = 0.02
+    nearly: float = 1e-3
+
+    def ended(self, step: Step, value: float) -> bool:
+        """Whether a step promises too little, at a value of the objective."""
+        settled = step.standard_deviations <= self.settled and step.promise <= self.nearly * value
+        return settled or step.promise <= self.tolerance * value + NEGLIGIBLE
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Step:
-    """A step of the moduli (2 count,) and of the loaded components (n_b,), mm, and by how much it should lower the objective."""
+    """A step of the search.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (2 count,)
+        Of the logarithms of the moduli.
+    loaded : list of ndarray, shape (n_b,)
+        Of the loaded components of every load case, mm.
+    promise : float
+        By how much it should lower the objective.
+    standard_deviations : float
+        By how many of their own, together, it moves the moduli; infinite where that is not known.
+    """
 
     theta: FloatArray
     loaded: list[FloatArray]
     promise: float
+    standard_deviations: float = np.inf
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +182,7 @@ def exact_step(at: Linearised, objective: Objective) -> Step:
     step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
     promise = -float(gradient @ step + 0.5 * step @ hessian @ step)
     loaded = 0.5 * sum(float(r @ p) for r, p in zip(data.offset, at.gradient()[1], strict=True))
-    return Step(step, data.loaded(step), promise + loaded)
+    return Step(step, data.loaded(step), promise + loaded, float(np.sqrt(max(step @ hessian @ step, 0.0))))
 
 
 def search(
@@ -185,7 +208,7 @@ def search(
     for iteration in range(chosen.max_iterations):
         at = model.linearised(point)
         step = rule(at, objective)
-        if step.promise <= chosen.tolerance * value + NEGLIGIBLE:
+        if chosen.ended(step, value):
             return Found(point, value, Status.CONVERGED, iteration)
         found = _line_search(at, step, objective, value)
         if found is None:

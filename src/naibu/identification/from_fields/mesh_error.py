@@ -128,6 +128,39 @@ def doubt_of(
     return np.abs(signed), np.diag(signed**2) if mixed else np.outer(signed, signed)
 
 
+def carried_over(covariance: FloatArray, information: FloatArray, apart: BoolArray) -> FloatArray:
+    """Return the covariance (k, k) of logarithms when those `apart` (k,) err as stated and all others are refitted to them.
+
+    `information` (k, k) is that of the data, which says by how much the others follow.
+    """
+    follow = np.eye(len(apart))
+    rest = np.flatnonzero(~apart)
+    if len(rest):
+        response = np.linalg.lstsq(information[np.ix_(rest, rest)], information[np.ix_(rest, np.flatnonzero(apart))], rcond=1e-12)[0]
+        follow[np.ix_(rest, np.flatnonzero(apart))] = -response
+    return np.asarray(follow @ covariance @ follow.T)
+
+
+def doubt_in_all(
+    relative: FloatArray, sure: BoolArray, information: FloatArray, apart: BoolArray, *, mixed: bool, thin: BoolArray | None
+) -> FloatArray:
+    """Return the covariance (2 count, 2 count) of `doubt_of`, that of zones set `apart` (count,) carried over to all others.
+
+    The change of zones set apart says nothing of how wrong others are but by that way, and does not count as the worst.
+    """
+    both = np.tile(apart, 2)
+    _, covariance = doubt_of(relative, mixed=mixed, thin=thin, sure=sure & ~both)
+    return carried_over(covariance, information, both) if apart.any() else covariance
+
+
+def at_least_to(other: FloatArray | None, theta: FloatArray, covariance: FloatArray) -> FloatArray:
+    """Return the covariance (2 count, 2 count) raised so that one standard deviation reaches logarithms found on another mesh, if any."""
+    if other is None:
+        return covariance
+    apart = relative_change(other - theta) ** 2
+    return np.asarray(covariance + np.diag(np.maximum(apart - np.diag(covariance), 0.0)))
+
+
 def refitted(
     at: Linearised, quadratic: Concentrated, changes: list[FloatArray], basis: FloatArray | None = None, pull: FloatArray | float = 0.0
 ) -> Refit:

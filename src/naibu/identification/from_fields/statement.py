@@ -42,6 +42,6 @@ def statement(
         Where the uncertainty stems from.
     """
     sure = judged.explanation is Explanation.EXPLAINED and not limits
-    how_well = report(zones, theta, found, budget=budget, usable=judged.ok, sure=sure, unit=zones.unit)
+    how_well = report(zones, theta, found, budget=budget, usable=judged.ok, sure=sure, unit=zones.unit, apart=judged.mesh_dependent)
     told = effects(others, zones, theta, intervals(theta, found)[0])
     return (judged.sentence, *limits, *measure, *judged.notes, *how_well, *told)

@@ -21,6 +21,7 @@ UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the information b
 PROBES = 24
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
 POISSON_POORLY = 0.1
+MESH_DEPENDENT = "not determined (depends on the mesh)"
 RESOLVED = 0.5
 
 
@@ -184,21 +185,34 @@ def report(
     usable: bool = True,
     sure: bool = True,
     unit: str = " kPa",
+    apart: Sequence[str] = (),
 ) -> tuple[str, ...]:
     """Say in words how well every zone's moduli are determined, from what the uncertainty stems, and what is determined worst.
 
     Nothing is called well determined unless the model explains the data and its elements are fine enough (`sure`); nor anything determined
-    where the result is not `usable`. `unit` is that of moduli: none of multiples.
+    where the result is not `usable`, or of zones set `apart`, which depend on the mesh. `unit` is that of moduli: none of multiples.
     """
     young, poisson = young_and_poisson(theta)
     of_young, of_poisson = found.of_young_and_poisson(theta)
     within = intervals(theta, found)
     lines = []
-    how = {"usable": usable, "sure": sure}
     for i, name in enumerate(zones.names):
-        line = _sentence(name, young[i], of_young[i], within[0][i], poisson[i], of_poisson[i], within[1][i], unit, **how)
+        how = grade(of_young[i], usable=usable, sure=sure, apart=name in apart)
+        line = _sentence(name, young[i], of_young[i], within[0][i], poisson[i], of_poisson[i], within[1][i], unit, how)
         lines.append(line + ("" if budget is None or not np.isfinite(of_young[i]) else _parts(budget, i, zones.count)))
     return (*lines, _worst(zones, found))
+
+
+def grade(of_young: float, *, usable: bool, sure: bool, apart: bool) -> str:
+    """Return in words how well Young's modulus is determined, of which `of_young` is the standard deviation of the logarithm."""
+    if not np.isfinite(of_young):
+        return "not determined"
+    if not usable:
+        return "not to be used"
+    if apart:
+        return MESH_DEPENDENT
+    best = "well" if sure else "within the model"
+    return f"{best if of_young < WELL else 'roughly' if of_young < POORLY else 'poorly'} determined"
 
 
 def _sentence(
@@ -210,15 +224,11 @@ def _sentence(
     of_poisson: float,
     nu: FloatArray,
     unit: str,
-    *,
-    usable: bool,
-    sure: bool,
+    how: str,
 ) -> str:
     if not np.isfinite(of_young):
         return f"{name}: the measurements do not determine its moduli."
-    best = "well" if sure else "within the model"
-    how = f"{best if of_young < WELL else 'roughly' if of_young < POORLY else 'poorly'} determined"
-    text = f"{name}: Young's modulus {young:.4g}{unit} is {how if usable else 'not to be used'} (standard error {100 * of_young:.2g} %, "
+    text = f"{name}: Young's modulus {young:.4g}{unit} is {how} (standard error {100 * of_young:.2g} %, "
     text += f"95 % interval {e[0]:.4g} to {e[1]:.4g}{unit})"
     if of_poisson > POISSON_POORLY:
         return text + f"; Poisson's ratio {poisson:.3f} is not (standard error {of_poisson:.2g}): take it from elsewhere."

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.mesh_error import relative_change
 from naibu.identification.from_fields.uncertainty import Uncertainty
@@ -70,11 +70,23 @@ class HalfSize:
         return after < FALLS * before
 
 
-def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize) -> Verdict:
+def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize, set_apart: BoolArray | None = None) -> Verdict:
     """Return the verdict on zones with these names, which end inside of cells.
 
     Moduli that the data determine and that move are no result; nor is anything where they determine no Young's modulus. Others that move
     are told in the notes as not determined. Where neighbours share residuals that elements of half the size leave, these come first.
+
+    Parameters
+    ----------
+    judged : Verdict
+        On the residuals.
+    names : sequence of str
+        Zones.
+    half : HalfSize
+        What elements of half the size change.
+    set_apart : ndarray, shape (count,), bool
+        Zones whose moduli may be anything without taking the results of the others away, because the intervals of those hold it: they are
+        named as not determined, and the verdict is in part at best. By default none.
     """
     moves = np.abs(half.changes) > WITHIN
     sure = half.standard_deviations < DETERMINED
@@ -84,12 +96,24 @@ def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize) -
     judged = replace(judged, notes=(*judged.notes, *notes))
     if not refused.any():
         return judged
+    lost = refused.any(axis=0)
+    apart = np.zeros(len(names), dtype=bool) if set_apart is None else set_apart
+    if (lost <= apart).all() and (sure[0] & ~lost).any():
+        return _without(judged, names, np.flatnonzero(lost), half)
     reason = f"zones end inside of elements, and with half their size moduli would change {half.times[refused].max():.2g} times"
     advised = f"{reason}: use smaller ones"
     reasons = (advised, *judged.reasons)
     if judged.explanation is not Explanation.EXPLAINED and judged.shared > SHARED and not half.falls:
         reasons = (*judged.reasons, f"elements of half the size leave such residuals as well; but {reason}")
     return replace(judged, explanation=Explanation.NOT_EXPLAINED, reasons=reasons)
+
+
+def _without(judged: Verdict, names: Sequence[str], lost: IntArray, half: HalfSize) -> Verdict:
+    """Return the verdict with zones (numbers `lost`) named as not determined."""
+    each = [f"{names[i]} (with half their size its moduli would change {half.times[:2, i].max():.2g} times)" for i in lost.tolist()]
+    limits = f"elements of this size do not determine {' and '.join(each)}"
+    part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
+    return replace(judged, explanation=part, limits=limits, mesh_dependent=tuple(names[i] for i in lost.tolist()))
 
 
 def limited_by_elements(judged: Verdict, names: Sequence[str], of_mesh: FloatArray, bounds: FloatArray) -> Verdict:
@@ -108,7 +132,7 @@ def limited_by_elements(judged: Verdict, names: Sequence[str], of_mesh: FloatArr
     bounds : ndarray, shape (count, 2)
         95 % intervals of Young's modulus, kPa.
     """
-    rough = np.flatnonzero(of_mesh > ROUGHLY)
+    rough = np.flatnonzero((of_mesh > ROUGHLY) & ~np.isin(names, judged.mesh_dependent))
     if not len(rough) or not judged.ok:
         return judged
     factors = np.sqrt(bounds[rough, 1] / bounds[rough, 0])
@@ -117,7 +141,7 @@ def limited_by_elements(judged: Verdict, names: Sequence[str], of_mesh: FloatArr
         for i, f in zip(rough.tolist(), factors, strict=True)
     ]
     known = f"elements of this size tell Young's modulus only roughly, {' and '.join(each)}"
-    return replace(judged, limits=known)
+    return replace(judged, limits=f"{judged.limits}; {known}" if judged.limits else known)
 
 
 def _told_open(name: str, which: IntArray, half: HalfSize, zone: int) -> str:

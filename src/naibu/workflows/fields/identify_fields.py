@@ -18,11 +18,10 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.estimate import TOO_COARSE, identify_field
+from naibu.identification.from_fields.estimate import TOO_COARSE
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
-from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
-from naibu.identification.from_fields.forward.representation_error import with_representation_error
+from naibu.identification.from_fields.forward.load_cases import KNOWN
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
@@ -38,31 +37,21 @@ from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.fields.block_mesh import (
-    BLURRED,
     CELLS,
     blurred,
     labelled_object,
-    mesh_that_shows,
-    misplaced,
-    moved_borders,
     names_of_labels,
-    region_in,
-    regions_of,
     sizes_of_voxels,
 )
-from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
-from naibu.workflows.fields.measured_load_case import doubts_of_field, measured_load_case, relative_deformation
+from naibu.workflows.fields.measured_load_case import doubts_of_field, relative_deformation
+from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ScannedObject, identified_on_smaller_cubes
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
 
-UNRESOLVED = (
-    "{}: {:.2g} % of the measurements lie where displacements change on a scale below that of the elements; what these cannot follow is "
-    "counted as their noise."
-)
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
 BEYOND_KNOWN = 1e4  # times the stiffest, or part of the softest, known Young's modulus
@@ -198,38 +187,36 @@ def identify_fields(
     names = names_of_labels(labels, inside, zone_names or {})
     stated = _stated(known, list(names.values()), each_cell=each_cell)
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
-    volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
-    most = CELLS_OF_MAP if each_cell else min(CELLS, max(int(field.valid.sum()) for field in read) // POINTS_OF_CELL)
-    size = element_size_mm or (volume / max(most, LEAST_CELLS)) ** (1.0 / 3.0)
+    measured = tuple((Path(p).stem, field) for p, field in zip(paths, read, strict=True))
+    scanned = ScannedObject(inside, labels, names, measured, tuple(loaded))
+    most = max(int(field.valid.sum()) for field in read) // POINTS_OF_CELL
+    usual = CELLS_OF_MAP if each_cell else min(CELLS, most)
+    size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
     sought = () if each_cell else set(names.values()) - set(stated.values)
-    mesh, cell_of_voxel = mesh_that_shows(inside, labels, names, sought, size, exactly=element_size_mm > 0.0)
-    left_out, wrong = misplaced(mesh, cell_of_voxel, inside, labels, names)
-    if not each_cell and wrong >= BLURRED:
-        mesh, cell_of_voxel = fitted_to_borders(mesh, cell_of_voxel, inside, regions_of(labels, names))
-        left_out, wrong = misplaced(mesh, cell_of_voxel, inside, labels, names)
-    cases = [measured_load_case(mesh, cell_of_voxel, inside, field, Path(p).stem, loaded) for p, field in zip(paths, read, strict=True)]
-    coarser = [(case, 0.0) if each_cell else with_representation_error(mesh, case) for case in cases]
-    cases = [case for case, _ in coarser]
-    within = None if each_cell or wrong < BLURRED else region_in(inside, labels, names)
+    cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])
     if stated is NOTHING_KNOWN:
-        found = identify_relative_map(mesh, cases, law=law, bounds=bounds, progress=progress)
+        found = identify_relative_map(cubes.mesh, cubes.load_cases, law=law, bounds=bounds, progress=progress)
     else:
-        given = Zones.of(mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative)
-        borders = moved_borders(mesh, inside, labels)
-        found = identify_field(mesh, cases, given, law=law, bounds=bounds, region_at=within, borders=borders, progress=progress)
+        found = cubes.identified(stated, law=law, bounds=bounds, each_cell=each_cell, progress=progress)
+        if not (each_cell or element_size_mm):
+            cubes, found = identified_on_smaller_cubes(
+                cubes, found, stated, most=min(MOST_REFINED, most), law=law, bounds=bounds, progress=progress
+            )
+    cases = cubes.load_cases
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
         found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
         load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
-        region_at=within,
+        region_at=cubes.region_at,
     )  # fmt: skip
-    coarse = blurred(left_out, wrong, corrected=within is not None and found.mesh_shift is not None)
+    corrected = cubes.region_at is not None and found.mesh_shift is not None
+    coarse = blurred(cubes.left_out, cubes.wrong, corrected=corrected)
     doubts = tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
-    coarse += tuple(UNRESOLVED.format(case.name, 100 * part) for case, part in coarser if part > 0.0)
+    coarse += cubes.noise
     notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
-    result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cell_of_voxel)
+    result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 

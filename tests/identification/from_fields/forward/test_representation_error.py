@@ -11,7 +11,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
-from naibu.identification.from_fields.forward.representation_error import with_representation_error
+from naibu.identification.from_fields.forward.representation_error import with_noise_of_neighbours, with_representation_error
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
 
@@ -68,3 +68,33 @@ def test_nothing_is_added_where_no_accuracy_is_stated() -> None:
     mesh, load_case = measured(kinked, stated_mm=None)
     same, part = with_representation_error(mesh, load_case)
     assert same is load_case and part == 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("times", [1.5, 3.0])
+def test_noise_that_is_stated_too_small_is_raised_to_what_neighbours_show(seed: int, times: float) -> None:
+    mesh, load_case = measured(smooth, sd_mm=times * SD_MM, seed=seed)
+    more, factor = with_noise_of_neighbours(mesh, load_case)
+    assert factor == pytest.approx(times, rel=0.08)
+    assert more.field.covariance is not None
+    np.testing.assert_allclose(more.field.covariance[:, 0, 0], (factor * SD_MM) ** 2)
+    np.testing.assert_array_equal(more.field.vectors, load_case.field.vectors)
+
+
+@pytest.mark.parametrize("times", [1.0, 0.7])
+def test_noise_that_is_stated_right_or_too_large_stays(times: float) -> None:
+    mesh, load_case = measured(smooth, sd_mm=times * SD_MM)
+    same, factor = with_noise_of_neighbours(mesh, load_case)
+    assert same is load_case and factor == 1.0
+
+
+def test_noise_that_is_not_stated_is_that_of_neighbours() -> None:
+    found, factor = with_noise_of_neighbours(*measured(smooth, sd_mm=2.0 * SD_MM, stated_mm=None))
+    assert found.field.covariance is not None and np.isnan(factor)
+    assert np.sqrt(found.field.covariance[:, 0, 0]) == pytest.approx(2.0 * SD_MM, rel=0.08)
+
+
+def test_a_few_points_that_cells_cannot_follow_are_no_noise_of_all() -> None:
+    """The kink takes a third of the cells and their neighbours; the median does not see it."""
+    mesh, load_case = measured(kinked)
+    assert with_noise_of_neighbours(mesh, load_case)[1] < 1.1

@@ -90,8 +90,8 @@ def conjugate_gradients(
     product: Callable[[list[FloatArray]], list[FloatArray]],
     precondition: Callable[[list[FloatArray]], list[FloatArray]],
     right: list[FloatArray],
-) -> list[FloatArray]:
-    """Solve independent systems of several load cases, every column by its own iteration, all advanced together."""
+) -> tuple[list[FloatArray], int]:
+    """Solve independent systems of several load cases, every column by its own iteration, all advanced together; also after how many."""
 
     def dot(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
         return [np.einsum("ij,ij->j", p, q) for p, q in zip(a, b, strict=True)]
@@ -101,7 +101,7 @@ def conjugate_gradients(
     p, rz = [np.zeros_like(b) for b in right], [np.ones(b.shape[1]) for b in right]
     for iteration in range(BOUNDARY_ITERATIONS):
         if all((np.linalg.norm(a, axis=0) <= limit).all() for a, limit in zip(r, target, strict=True)):
-            return x
+            return x, iteration
         z = precondition(r)
         new = dot(r, z)
         for t in range(len(p)):

@@ -9,22 +9,24 @@ of the measurement from the nearest interpolated displacement; by Cea's lemma th
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import cg
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.forward.forward_model import SURFACE_STRAIN
+from naibu.identification.from_fields.forward.forward_model import EXACT, SURFACE_STRAIN
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.meshing.point_location import locate
 
 PROBES = 24  # random signs that estimate how far points are followed because they were fitted (:cite:p:`bekas2007`)
 SIGNIFICANT = 3.0  # standard deviations by which squares exceed those of noise
 FEWEST = 0.2  # of the measurements around a cell: degrees of freedom that the nodes must leave
+NOTEWORTHY = 1.05  # standard deviations are hardly ever known better
+PASSES = 2  # with a noise that is not stated: how much the nearest displacement is smoothed depends a little on it
 
 
 def with_representation_error(mesh: Mesh, load_case: FieldLoadCase) -> tuple[FieldLoadCase, float]:
@@ -51,40 +53,116 @@ def with_representation_error(mesh: Mesh, load_case: FieldLoadCase) -> tuple[Fie
     return replace(load_case, field=more), float(np.mean(variance > 0.0))
 
 
+def with_noise_of_neighbours(mesh: Mesh, load_case: FieldLoadCase) -> tuple[FieldLoadCase, float]:
+    """Return the load case with covariances raised to the noise that neighbours show, and the factor of standard deviations, 1 or more.
+
+    Rules that choose how much a map may vary (the discrepancy principle, the information criterion of its regions) take noise that is
+    stated too small for structure of the body. How far measurements scatter about the nearest interpolated displacement, in the degrees of
+    freedom that its nodes leave, tells the noise without any mechanics. Where no covariance is stated, all of it is found so, and the
+    factor is NaN.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The model.
+    load_case : FieldLoadCase
+        Measurements within its cells, mm.
+    """
+    field = load_case.field
+    if not field.valid.all():
+        return load_case, 1.0
+    d, stated = field.vectors.shape[1], field.covariance is not None
+    covariance = field.covariance
+    if covariance is None:
+        nominal = (EXACT * float(np.abs(field.vectors).max())) ** 2
+        covariance = np.broadcast_to(nominal * np.eye(d), (len(field.points), d, d))
+    if not (np.trace(covariance, axis1=1, axis2=2) > 0.0).all():
+        return load_case, 1.0
+    factor = 1.0
+    for _ in range(1 if stated else PASSES):
+        square = _noise_factor(mesh, DisplacementField.from_arrays(field.points, field.vectors, covariance=covariance))
+        factor, covariance = factor * square**0.5, square * covariance
+    if stated and factor == 1.0:
+        return load_case, 1.0
+    more = DisplacementField.from_arrays(field.points, field.vectors, covariance=covariance)
+    return replace(load_case, field=more), factor if stated else float("nan")
+
+
+def _noise_factor(mesh: Mesh, field: DisplacementField) -> float:
+    """Return the variance of measurements about the nearest interpolated displacement over that stated, 1 where it is not clearly more."""
+    scatter = _Scatter.of(mesh, field)
+    if not scatter.enough.any():
+        return 1.0
+    square = float(np.median(scatter.ratio[scatter.cells]))
+    doubt = float(np.sqrt(2.0 / (field.vectors.shape[1] * scatter.total_freedom)))
+    return square if square > max(1.0 + SIGNIFICANT * doubt, NOTEWORTHY**2) else 1.0
+
+
 def _variance(mesh: Mesh, field: DisplacementField) -> FloatArray:
     """Return the variance (k,) of a component, mm^2, that no interpolated displacement follows, alike in a cell and its neighbours."""
     assert field.covariance is not None
-    d, n = field.vectors.shape[1], mesh.n_points
+    d = field.vectors.shape[1]
     stated = np.trace(field.covariance, axis1=1, axis2=2) / d
     if not (stated > 0.0).all():
         return np.zeros(len(stated))
-    at = locate(mesh, field.points, tolerance_mm=np.inf)
-    rows = np.repeat(np.arange(len(stated)), at.weights.shape[1])
-    within = sp.csr_matrix((at.weights.ravel(), (rows, mesh.cells[at.cells].ravel())), shape=(len(stated), n))
-    whole = sp.diags(stated**-0.5) @ within
-    matrix = (whole.T @ whole + _smoothness(mesh)).tocsr()
-    inverse_diagonal = sp.diags(1.0 / matrix.diagonal())
+    found = _Scatter.of(mesh, field)
+    factor = max(1.0, float(np.median(found.ratio[found.cells]))) if found.enough.any() else 1.0
+    beyond = found.ratio / factor - 1.0
+    significant = found.enough & (beyond > SIGNIFICANT * np.sqrt(2.0 / (d * np.maximum(found.freedom, 1.0))))
+    return np.asarray(np.where(significant, factor * beyond, 0.0)[found.cells] * stated)
 
-    def followed(values: FloatArray) -> FloatArray:
-        right = whole.T @ values
-        return np.stack([whole @ cg(matrix, b, rtol=1e-6, maxiter=2000, M=inverse_diagonal)[0] for b in right.T], axis=1)
 
-    measured = field.vectors / np.sqrt(stated)[:, None]
-    left = ((measured - followed(measured)) ** 2).sum(axis=1) / d
-    signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(stated), PROBES))
-    free = 1.0 - np.clip((signs * followed(signs)).mean(axis=1), 0.0, 1.0)
-    touched = sp.csr_matrix(
-        (np.ones(mesh.cells.size), (np.repeat(np.arange(mesh.n_cells), mesh.cells.shape[1]), mesh.cells.ravel())), (mesh.n_cells, n)
-    )
-    near = sp.csr_matrix(touched @ touched.T)
-    near.data[:] = 1.0
-    squares, freedom, count = (near @ np.bincount(at.cells, v, mesh.n_cells) for v in (left, free, np.ones_like(free)))
-    enough = freedom > np.maximum(FEWEST * count, 1.0)
-    ratio = squares / np.maximum(freedom, 1.0)
-    factor = max(1.0, float(np.median(ratio[at.cells]))) if enough.any() else 1.0
-    beyond = ratio / factor - 1.0
-    significant = enough & (beyond > SIGNIFICANT * np.sqrt(2.0 / (d * np.maximum(freedom, 1.0))))
-    return np.asarray(np.where(significant, factor * beyond, 0.0)[at.cells] * stated)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Scatter:
+    """Measurements about the nearest interpolated displacement.
+
+    Attributes
+    ----------
+    cells : ndarray, shape (k,), int64
+        Cell of every measurement.
+    ratio, freedom : ndarray, shape (m,)
+        In a cell and its neighbours: variance over that stated, and the degrees of freedom that nodes leave, of one component.
+    enough : ndarray, shape (m,), bool
+        Where these are enough to tell.
+    total_freedom : float
+        Of one component, in all cells.
+    """
+
+    cells: IntArray
+    ratio: FloatArray
+    freedom: FloatArray
+    enough: BoolArray
+    total_freedom: float
+
+    @classmethod
+    def of(cls, mesh: Mesh, field: DisplacementField) -> _Scatter:
+        """Compare measurements with positive variances with the nearest interpolated displacement."""
+        assert field.covariance is not None
+        d, n = field.vectors.shape[1], mesh.n_points
+        stated = np.trace(field.covariance, axis1=1, axis2=2) / d
+        at = locate(mesh, field.points, tolerance_mm=np.inf)
+        rows = np.repeat(np.arange(len(stated)), at.weights.shape[1])
+        within = sp.csr_matrix((at.weights.ravel(), (rows, mesh.cells[at.cells].ravel())), shape=(len(stated), n))
+        whole = sp.diags(stated**-0.5) @ within
+        matrix = (whole.T @ whole + _smoothness(mesh)).tocsr()
+        inverse_diagonal = sp.diags(1.0 / matrix.diagonal())
+
+        def followed(values: FloatArray) -> FloatArray:
+            right = whole.T @ values
+            return np.stack([whole @ cg(matrix, b, rtol=1e-6, maxiter=2000, M=inverse_diagonal)[0] for b in right.T], axis=1)
+
+        measured = field.vectors / np.sqrt(stated)[:, None]
+        left = ((measured - followed(measured)) ** 2).sum(axis=1) / d
+        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(len(stated), PROBES))
+        free = 1.0 - np.clip((signs * followed(signs)).mean(axis=1), 0.0, 1.0)
+        touched = sp.csr_matrix(
+            (np.ones(mesh.cells.size), (np.repeat(np.arange(mesh.n_cells), mesh.cells.shape[1]), mesh.cells.ravel())), (mesh.n_cells, n)
+        )
+        near = sp.csr_matrix(touched @ touched.T)
+        near.data[:] = 1.0
+        squares, freedom, count = (near @ np.bincount(at.cells, v, mesh.n_cells) for v in (left, free, np.ones_like(free)))
+        enough = freedom > np.maximum(FEWEST * count, 1.0)
+        return cls(at.cells, squares / np.maximum(freedom, 1.0), freedom, enough, float(free.sum()))
 
 
 def _smoothness(mesh: Mesh) -> sp.csr_matrix:

@@ -28,6 +28,9 @@ from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
 REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
+OUTDATED = (
+    60  # iterations of conjugate gradients from which the Hessian of loaded components is made anew: that costs as much as a few solutions
+)
 Gradient = tuple[FloatArray, list[FloatArray]]  # with respect to theta, and to the sought displacements of every load case
 
 
@@ -327,10 +330,13 @@ class Linearised:
             return [a + o.prior @ b for a, o, b in zip(self.adjoint(pulled)[1], self.model.observed, loaded, strict=True)]
 
         try:
-            return conjugate_gradients(product, self.preconditioned, list(right))
+            found, iterations = conjugate_gradients(product, self.preconditioned, list(right))
         except ConvergenceError:  # the preconditioner is that of other moduli, too far from these
             self.model.boundary[:] = [None] * len(self.model.boundary)
-            return conjugate_gradients(product, self.preconditioned, list(right))
+            return conjugate_gradients(product, self.preconditioned, list(right))[0]
+        if iterations > OUTDATED:
+            self.model.boundary[:] = [None] * len(self.model.boundary)
+        return found
 
     def concentrated(self, basis: FloatArray) -> Concentrated:
         """Return half the misfit as a quadratic in changes of theta along `basis` (2 count, k), minimised over the loaded components."""

@@ -193,13 +193,12 @@ class CorrectedRegions:
     converged: bool
 
     @property
-    def doubt(self) -> tuple[FloatArray, FloatArray]:
-        """Standard deviations (2 regions,) and covariance (2 regions, 2 regions) of what still smaller cells would change.
+    def doubt(self) -> FloatArray:
+        """Covariance (2 regions, 2 regions) of what still smaller cells would change.
 
         Regions share their borders: none is surer than the one that changed most.
         """
-        sd = np.full_like(self.shift, DOUBT * float(np.abs(self.shift).max(initial=0.0)))
-        return sd, np.diag(sd**2)
+        return np.diag(np.full_like(self.shift, DOUBT * float(np.abs(self.shift).max(initial=0.0))) ** 2)
 
 
 def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bounds: Bounds) -> CorrectedRegions | None:

@@ -1,0 +1,188 @@
+"""An object with its measured fields on cubes of one size, and its moduli identified on them, on smaller ones where these change moduli."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.mesh import Mesh
+from naibu.core.progress import Progress, report_progress
+from naibu.core.volume import Volume
+from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.field_estimate import FieldEstimate
+from naibu.identification.from_fields.forward.field_laws import LawName
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.representation_error import with_noise_of_neighbours, with_representation_error
+from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
+from naibu.identification.from_fields.gauss_newton import Bounds
+from naibu.workflows.fields.block_mesh import BLURRED, mesh_that_shows, misplaced, moved_borders, region_in, regions_of
+from naibu.workflows.fields.border_fitting import fitted_to_borders
+from naibu.workflows.fields.known_zones import KnownZones
+from naibu.workflows.fields.measured_load_case import measured_load_case
+
+MOST_REFINED = 4200  # cells that are made unasked where smaller ones change moduli: a few minutes on two cores
+WORTHWHILE = 0.85  # of the edge length: refinement by less changes little
+HALF = 0.5  # of it: the least by which cells are made smaller at once
+UNRESOLVED = (
+    "{}: {:.2g} % of the measurements lie where displacements change on a scale below that of the elements; what these cannot follow is "
+    "counted as their noise."
+)
+UNDERSTATED = "{}: measurements scatter {:.2g} times as much about any displacement of the cubes as is stated; that counts as their noise."
+UNSTATED = (
+    "{}: no standard deviation is stated; measurements scatter by {:.2g} mm about any displacement of the cubes, which is taken for it."
+)
+COMPRESSIBLE = 0.48  # largest Poisson's ratio from which a search on smaller cells starts
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScannedObject:
+    """An object in a scan with the fields measured in it.
+
+    Attributes
+    ----------
+    inside : Volume
+        Not zero in the object.
+    labels : ndarray, shape (nz, ny, nx), int64
+        Zone of every voxel.
+    names : mapping
+        Names of the labels.
+    fields : tuple of (str, DisplacementField)
+        Names and measured fields.
+    loaded : tuple of str
+        Sides at which forces act; the whole surface where there are none.
+    """
+
+    inside: Volume
+    labels: IntArray
+    names: Mapping[int, str]
+    fields: tuple[tuple[str, DisplacementField], ...]
+    loaded: tuple[str, ...]
+
+    @property
+    def volume_mm3(self) -> float:
+        """Volume of the object."""
+        return float(self.inside.values.sum() * np.prod(self.inside.spacing_mm))
+
+    def on_cubes(self, size_mm: float, sought: Collection[str], *, exactly: bool, each_cell: bool) -> ObjectOnCubes:
+        """Return the object on cubes of an edge length (see `mesh_that_shows`), moved onto borders of zones unless it is to be mapped."""
+        mesh, cell_of_voxel = mesh_that_shows(self.inside, self.labels, self.names, sought, size_mm, exactly=exactly)
+        left_out, wrong = misplaced(mesh, cell_of_voxel, self.inside, self.labels, self.names)
+        if not each_cell and wrong >= BLURRED:
+            mesh, cell_of_voxel = fitted_to_borders(mesh, cell_of_voxel, self.inside, regions_of(self.labels, self.names))
+            left_out, wrong = misplaced(mesh, cell_of_voxel, self.inside, self.labels, self.names)
+        cases = [measured_load_case(mesh, cell_of_voxel, self.inside, field, name, self.loaded) for name, field in self.fields]
+        coarser = [with_noise_of_neighbours(mesh, case) if each_cell else with_representation_error(mesh, case) for case in cases]
+        words = tuple(text for more, found in coarser for text in _told(more, found, each_cell=each_cell))
+        within = None if each_cell or wrong < BLURRED else region_in(self.inside, self.labels, self.names)
+        return ObjectOnCubes(self, mesh, cell_of_voxel, tuple(case for case, _ in coarser), words, left_out, wrong, within)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObjectOnCubes:
+    """The object as cubes, with its load cases.
+
+    Attributes
+    ----------
+    scanned : ScannedObject
+        What is modelled.
+    mesh : Mesh
+        Cubes that fill it, one region a label.
+    cell_of_voxel : ndarray, shape (nz, ny, nx), int64
+        Cell of every voxel, -1 outside.
+    load_cases : tuple of FieldLoadCase
+        One for each field.
+    noise : tuple of str
+        What counts as noise of measurements beyond what is stated, in words.
+    left_out, wrong : float
+        Parts of the object that cubes leave out, and assign to another zone.
+    region_at : callable or None
+        Region of the mesh at points, where zones end inside of cubes.
+    """
+
+    scanned: ScannedObject
+    mesh: Mesh
+    cell_of_voxel: IntArray
+    load_cases: tuple[FieldLoadCase, ...]
+    noise: tuple[str, ...]
+    left_out: float
+    wrong: float
+    region_at: RegionAt | None
+
+    def identified(
+        self,
+        stated: KnownZones,
+        *,
+        law: LawName,
+        bounds: Bounds,
+        each_cell: bool,
+        progress: Progress | None,
+        coarser: FieldEstimate | None = None,
+    ) -> FieldEstimate:
+        """Return the moduli of zones that are not stated (see `identify_field`), from those on coarser cubes where these are known."""
+        given = Zones.of(self.mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative)
+        borders = moved_borders(self.mesh, self.scanned.inside, self.scanned.labels)
+        start, other = (None, None) if coarser is None else (_start(coarser), coarser.theta)
+        return identify_field(
+            self.mesh, self.load_cases, given, law=law, bounds=bounds, start=start, region_at=self.region_at, borders=borders,
+            other_mesh=other, progress=progress,
+        )  # fmt: skip
+
+
+def _told(case: FieldLoadCase, found: float, *, each_cell: bool) -> tuple[str, ...]:
+    """Say what counts as noise: by how much more than stated it is in a map, else in which part of the points cubes cannot follow."""
+    if not each_cell:
+        return (UNRESOLVED.format(case.name, 100 * found),) if found > 0.0 else ()
+    if np.isnan(found):
+        assert case.field.covariance is not None
+        return (UNSTATED.format(case.name, float(np.sqrt(case.field.covariance[0, 0, 0]))),)
+    return (UNDERSTATED.format(case.name, found),) if found > 1.0 else ()
+
+
+def smaller_size(volume_mm3: float, mesh: Mesh, most: int) -> float | None:
+    """Return the edge length, mm, of at most half as large cubes of which there are about `most`; None where that changes little."""
+    size = (volume_mm3 / mesh.n_cells) ** (1.0 / 3.0)
+    smaller = max(HALF, (mesh.n_cells / most) ** (1.0 / 3.0)) * size
+    return smaller if smaller < WORTHWHILE * size else None
+
+
+def identified_on_smaller_cubes(
+    cubes: ObjectOnCubes,
+    found: FieldEstimate,
+    stated: KnownZones,
+    *,
+    most: int,
+    law: LawName,
+    bounds: Bounds,
+    progress: Progress | None,
+) -> tuple[ObjectOnCubes, FieldEstimate]:
+    """Return the object on smaller cubes and its moduli there, where the size of cubes limits what is known; else what is given.
+
+    Parameters
+    ----------
+    cubes, found
+        The object and its moduli.
+    stated : KnownZones
+        What is known.
+    most : int
+        Cells that are made at most.
+    law, bounds, progress
+        See `identify_field`.
+    """
+    scanned = cubes.scanned
+    size = smaller_size(scanned.volume_mm3, cubes.mesh, most) if found.limited_by_mesh else None
+    if size is None:
+        return cubes, found
+    report_progress(progress, f"the size of cubes limits what is known of moduli: again with cubes of {size:.2g} mm")
+    smaller = scanned.on_cubes(size, (), exactly=True, each_cell=False)
+    return smaller, smaller.identified(stated, law=law, bounds=bounds, each_cell=False, progress=progress, coarser=found)
+
+
+def _start(found: FieldEstimate) -> tuple[FloatArray, FloatArray]:
+    """Return lambda and mu (count,), kPa, from which a search on smaller cubes starts."""
+    shear = found.young_modulus / (2.0 * (1.0 + found.poisson_ratio))
+    poisson = np.minimum(found.poisson_ratio, COMPRESSIBLE)
+    return 2.0 * shear * poisson / (1.0 - 2.0 * poisson), shear
