@@ -21,10 +21,11 @@ class Wall:
     """A wall across z, at a gap above all nodes, that pushes and does not pull."""
 
     def __init__(self) -> None:
-        self.deep = np.zeros(0)
+        self.deep, self.exerted = np.zeros(0), 0.0
 
     def __call__(self, motion: FloatArray) -> FloatArray:
         self.deep = np.maximum(motion[:, 2] - GAP, 0.0)
+        self.exerted = WALL * float(self.deep.sum())
         return np.column_stack([np.zeros((len(motion), 2)), -WALL * self.deep])
 
     def change(self) -> BlockChange:
@@ -41,7 +42,7 @@ class RoughWall:
     """A wall across z at z = 0 with Coulomb friction: tangential penalties up to a limit that grows with the pressure."""
 
     def __init__(self, friction: float, tangential: float) -> None:
-        self.friction, self.tangential, self.changes, self.last = friction, tangential, 0, np.zeros((0, 3))
+        self.friction, self.tangential, self.changes, self.last, self.exerted = friction, tangential, 0, np.zeros((0, 3)), 0.0
 
     def __call__(self, motion: FloatArray) -> FloatArray:
         self.last = motion.copy()
@@ -49,7 +50,9 @@ class RoughWall:
         trial = -self.tangential * motion[:, :2]
         size = np.linalg.norm(trial, axis=1)
         limit = self.friction * pressure
-        return np.column_stack([trial * (np.minimum(size, limit) / np.maximum(size, 1e-300))[:, None], -pressure])
+        force = np.column_stack([trial * (np.minimum(size, limit) / np.maximum(size, 1e-300))[:, None], -pressure])
+        self.exerted = float(np.abs(force).sum())
+        return force
 
     def change(self) -> BlockChange:
         self.changes += 1
@@ -182,6 +185,7 @@ class SoftWall(Wall):
     def __call__(self, motion: FloatArray) -> FloatArray:
         self.deep = np.maximum(motion[:, 2] - GAP, 0.0)
         ramp = np.where(self.deep < self.RAMP, 0.5 * self.deep**2 / self.RAMP, self.deep - 0.5 * self.RAMP)
+        self.exerted = WALL * float(ramp.sum())
         return np.column_stack([np.zeros((len(motion), 2)), -WALL * ramp])
 
     def change(self) -> BlockChange:

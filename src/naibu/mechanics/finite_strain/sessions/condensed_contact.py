@@ -46,7 +46,16 @@ ENOUGH = 0.005  # likewise, where no further matrix is worth while
 
 
 class ContactLaw(Protocol):
-    """Forces of contacts at a motion of their nodes."""
+    """Forces of contacts at a motion of their nodes, beside those that a tangent contains.
+
+    Attributes
+    ----------
+    exerted : float
+        Sum of the components of all forces of contact at the last motion, mN, those that the tangent contains included. Where sides slide
+        that stick in the tangent, these forces are small, and those beside it are not.
+    """
+
+    exerted: float
 
     def __call__(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
@@ -151,9 +160,11 @@ class CondensedContact:
         useless = self._changed is None
         while evaluations < EVALUATIONS:
             if at.size <= tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, begin, law, BALANCED, faint_mn):
-                break
+                return at.force
             if self._changed is None or useless:
-                if changes == most or self._consistent(at, begin, law, ENOUGH, faint_mn):
+                if self._consistent(at, begin, law, ENOUGH, faint_mn):
+                    return at.force
+                if changes == most:
                     break
                 yield
                 if changes == unaided and not self._springs.any() and len(held := law.opened().nodes):
@@ -188,7 +199,7 @@ class CondensedContact:
         """Whether the forces of a motion are, but for little, those of the motion that they lead to; the law is left where it was."""
         apart = float(np.abs(self._forces(at.motion - at.left, begin, law) - at.force).sum())
         law(at.motion)
-        return apart <= fraction * (float(np.abs(at.force).sum()) + faint_mn)
+        return apart <= fraction * (min(float(np.abs(at.force).sum()), law.exerted) + faint_mn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,6 +250,7 @@ class ContactBesideTangent:
     places: Sequence[Int32Array]
     pattern: BlockPattern
     tangent: EarlierTangent
+    exerted: float = field(init=False, default=0.0)
     _place: IntArray = field(init=False)
 
     def __post_init__(self) -> None:
@@ -251,9 +263,12 @@ class ContactBesideTangent:
         moved[self.nodes] += motion
         pattern = self.pattern
         add_earlier_forces(pattern.indptr, pattern.indices, self.tangent.contact, self.nodes, self._place, motion, force)
+        own = np.zeros_like(force)
         for contact in self.contacts:
-            contact.add_force(moved, force)
-        return np.asarray(force[self.nodes])
+            contact.add_force(moved, own if isinstance(contact, NearbyContact) else force)
+        sides = sum(contact.exerted for contact in self.contacts if isinstance(contact, LipsBesideTangent))
+        self.exerted = float(np.abs(own).sum()) + sides
+        return np.asarray((force + own)[self.nodes])
 
     def change(self) -> BlockChange:
         """Return the stiffness at the last motion; see `ContactLaw`."""

@@ -36,12 +36,15 @@ class LipsBesideTangent:
         From which the body moves, mm.
     earlier : ndarray, shape (k, 3, 3)
         Stiffness of the pairs in the tangent, mN/mm.
+    exerted : float
+        Sum of the components of the forces on both sides at the last evaluation, mN.
     """
 
     lips: CutLips
     points: IntArray
     displacement: FloatArray
     earlier: FloatArray
+    exerted: float = field(init=False, default=0.0)
     _now: FloatArray = field(init=False)
     _before: FloatArray = field(init=False)  # internal forces on the first nodes (k, 3), mN
     _begun: FloatArray = field(init=False)  # positions of the second nodes relative to the first (k, 3), mm
@@ -66,6 +69,7 @@ class LipsBesideTangent:
         moved = displacement[second] - displacement[first] - (self.displacement[second] - self.displacement[first])
         change = np.empty_like(self._before)
         self._evaluate(self._begun + moved, change)
+        self.exerted = 2.0 * float(np.abs(change).sum())
         change += np.einsum("pij,pj->pi", self.earlier, moved) - self._before
         np.subtract.at(force, first, change)
         np.add.at(force, second, change)
