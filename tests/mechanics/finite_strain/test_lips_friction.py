@@ -267,7 +267,7 @@ def test_in_real_time_the_force_on_a_steep_cut_is_that_of_a_sliding_wedge() -> N
 
 
 def test_the_way_by_the_balance_without_friction_comes_to_the_same_balance() -> None:
-    """Pressed and sheared in one step from where nothing pressed: by Newton's method, and by way of the frictionless balance."""
+    """Pressed and sheared in one step from where nothing pressed: by Newton's method, its secant, or by way of the frictionless balance."""
     mesh = inclined(0.0)
     made = problem(mesh, (0.0, 0.0, 0.0), 0.3).assembler
     engine, _ = stepped_by(DynamicEngine, made, mesh, 5e-3)
@@ -277,11 +277,13 @@ def test_the_way_by_the_balance_without_friction_comes_to_the_same_balance() -> 
         direct = session._balanced(5e-3, moving, ())
         guess = np.zeros_like(mesh.points)
         guess[high] = 5e-3 * moving[1]
-        around = session._rubbing(session._implicit_step(5e-3, ()), guess)
-    assert direct is not None and around is not None
+        step = session._implicit_step(5e-3, ())
+        around, straight = session._by_way_of_no_friction(step, guess), session._found(session._with_secant(step), guess)
+    assert direct is not None and around is not None and straight is not None
     stepped = engine.assembler.in_step(np.zeros_like(mesh.points))
     assert isinstance(stepped, LipAssembler) and stepped.lips is not None
     across, traction = stepped.lips.slip_forces(around)
     assert across.sum() > 10.0 and np.linalg.norm(traction, axis=1).max() > 0.1
     np.testing.assert_allclose(stepped.lips.slip_forces(direct)[1], traction, atol=2e-3 * np.abs(traction).max())
     np.testing.assert_allclose(direct, around, atol=2e-3 * np.abs(direct).max())
+    np.testing.assert_allclose(straight, around, atol=2e-3 * np.abs(direct).max())

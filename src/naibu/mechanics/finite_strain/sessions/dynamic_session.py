@@ -35,6 +35,7 @@ from naibu.mechanics.linear_algebra.recycled_factors import NEWTON_TOLERANCE, Re
 SUBDIVISIONS = 5  # of a step that does not converge: halves, quarters, ...
 PENETRATION = 0.01  # of the edge of a face, to which the penalties limit how deep indenters go into it, as in statics
 MOST_RAISES = 6  # of the penalties in a step
+DIRECT_ITERATIONS = 5  # of Newton's method with friction: steps that it balances take fewer
 RUBBING_ITERATIONS = 40  # of Newton's method without friction, and with its secant, which converges slowly
 
 
@@ -252,9 +253,7 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
             target = np.where(self._constrained, start.displacement, guess)
             for nodes, speed in zip(self.bodies, moving, strict=True):
                 target[nodes] = start.displacement[nodes] + h * speed
-            found = self._found(step, target)
-            if found is None and step.assembler.unsymmetric:
-                found = self._rubbing(step, target)
+            found = self._rubbing(step, target) if step.assembler.unsymmetric else self._found(step, target)
             if found is not None:
                 return found
         return None
@@ -266,14 +265,28 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
             return None
 
     def _rubbing(self, step: ImplicitStep, guess: FloatArray) -> FloatArray | None:
+        """Return the balance of a step whose sides of cuts rub.
+
+        Newton's method converges in a few iterations or not at all. With the symmetric secant of friction it takes more of them and fails
+        more rarely.
+        """
+        found = self._found(replace(step, iterations=min(DIRECT_ITERATIONS, step.iterations)), guess)
+        if found is None:
+            found = self._found(self._with_secant(step), guess)
+        return self._by_way_of_no_friction(step, guess) if found is None else found
+
+    def _by_way_of_no_friction(self, step: ImplicitStep, guess: FloatArray) -> FloatArray | None:
         """Return the balance of a step whose sides of cuts rub, by way of the one without friction, whose pressures are nearly its own.
 
         Newton's method fails where many pairs close, and begin to slip, at once: when a loaded body is cut, none of them presses yet.
         """
         smooth = replace(step, assembler=with_friction(step.assembler, 0.0), iterations=RUBBING_ITERATIONS)
-        symmetric = replace(step, assembler=with_secant(step.assembler, self.reached.lips), iterations=RUBBING_ITERATIONS)
         found = self._found(smooth, guess)
-        return None if found is None else self._found(symmetric, found)
+        return None if found is None else self._found(self._with_secant(step), found)
+
+    def _with_secant(self, step: ImplicitStep) -> ImplicitStep:
+        """Return the step with the secant of friction in its tangent."""
+        return replace(step, assembler=with_secant(step.assembler, self.reached.lips), iterations=RUBBING_ITERATIONS)
 
     def _implicit_step(self, h: float, contacts: tuple[Contact, ...]) -> ImplicitStep:
         engine, start = self.engine, self.reached
