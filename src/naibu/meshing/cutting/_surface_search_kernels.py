@@ -6,6 +6,9 @@ import numpy as np
 
 from naibu._numba.compilation import njit
 
+FOLD = 0.7  # cosine of the angle between two triangles, below which the path gets a point on their edge
+_NO_FOLDS = np.zeros(0, dtype=np.int64)
+
 
 @njit(cache=True)
 def dot(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]  # pragma: no cover
@@ -103,11 +106,23 @@ def nearest(s, start, q, radius, jump, queue, point):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _beside(p, a, b, c, q, point):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Distance of q from a point of a triangle, within the triangle's plane."""
+def normal_of(p, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Vector normal to a triangle, whose length is twice its area."""
     ux, uy, uz = from_to(p, a, b)
     vx, vy, vz = from_to(p, a, c)
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+
+
+@njit(cache=True)
+def folded(one, two):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether two normals differ by so much that the path has a point where the surface turns from one to the other."""
+    return dot(*one, *two) < FOLD * np.sqrt(dot(*one, *one) * dot(*two, *two))
+
+
+@njit(cache=True)
+def _beside(p, a, b, c, q, point):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Distance of q from a point of a triangle, within the triangle's plane."""
+    nx, ny, nz = normal_of(p, a, b, c)
     gx, gy, gz = q[0] - point[0], q[1] - point[1], q[2] - point[2]
     out = dot(gx, gy, gz, nx, ny, nz) / dot(nx, ny, nz, nx, ny, nz)
     gx, gy, gz = gx - out * nx, gy - out * ny, gz - out * nz
@@ -130,18 +145,37 @@ def first_at(length, m, at):  # type: ignore[no-untyped-def]  # pragma: no cover
 @njit(cache=True)
 def on_path(path, length, m, qx, qy, qz, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return distance of q from the part of the path between two lengths, and the length of the nearest point."""
+    return on_side_of_path(path, length, path[:0], _NO_FOLDS, m, qx, qy, qz, low, high, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+@njit(cache=True)
+def on_side_of_path(path, length, normals, folds, m, qx, qy, qz, low, high, one, two):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return what `on_path` does, of those pieces of the path only that face as one of two normals does, where unit normals are given.
+
+    So what lies across a fold is not near. `folds` counts those before each piece: behind one, pieces face as the normals do more exactly.
+    The distance is infinite where no piece faces as they do.
+    """
     j = max(0, first_at(length, m, low) - 1)
-    best, where = np.inf, low
+    best, where, before = np.inf, low, 0
+    least1, least2 = FOLD * np.sqrt(dot(*one, *one)), FOLD * np.sqrt(dot(*two, *two))
+    if len(normals) and j < m - 1:
+        before = folds[j + 1]
     while j < m - 1 and length[j] <= high:
+        if len(normals):
+            x, y, z = normals[j + 1]
+            d1, d2 = dot(x, y, z, *one), dot(x, y, z, *two)
+            if (d1 < 0.0 and d2 < 0.0) or (folds[j + 1] > before and d1 < least1 and d2 < least2):
+                j += 1
+                continue
         ex, ey, ez = from_to(path, j, j + 1)
         wx, wy, wz = qx - path[j, 0], qy - path[j, 1], qz - path[j, 2]
         f = dot(wx, wy, wz, ex, ey, ez) / max(dot(ex, ey, ez, ex, ey, ez), 1e-300)
         step = length[j + 1] - length[j]
         f = min(min(1.0, (high - length[j]) / step), max(max(0.0, (low - length[j]) / step), f))
         dx, dy, dz = wx - f * ex, wy - f * ey, wz - f * ez
-        d2 = dot(dx, dy, dz, dx, dy, dz)
-        if d2 < best:
-            best, where = d2, length[j] + f * step
+        gap2 = dot(dx, dy, dz, dx, dy, dz)
+        if gap2 < best:
+            best, where = gap2, length[j] + f * step
         j += 1
     return np.sqrt(best), where
 

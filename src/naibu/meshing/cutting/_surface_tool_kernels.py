@@ -7,7 +7,8 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu.meshing.cutting._surface_grid_kernels import nearest_listed
 from naibu.meshing.cutting._surface_kernels import INSIDE, RIM
-from naibu.meshing.cutting._surface_search_kernels import dot, first_at, nearest, on_path
+from naibu.meshing.cutting._surface_search_kernels import dot, first_at, folded, nearest, normal_of, on_path, on_side_of_path
+from naibu.meshing.cutting._surface_trace_kernels import MOST_CREASES, creases
 from naibu.meshing.cutting._surface_walk_kernels import (
     AT,
     AT_BOUNDARY,
@@ -17,6 +18,7 @@ from naibu.meshing.cutting._surface_walk_kernels import (
     COUNT,
     DISTANCE,
     ENDED,
+    ENTERED,
     FULL,
     HEIGHT,
     LAST,
@@ -38,6 +40,7 @@ from naibu.meshing.cutting._surface_walk_kernels import (
 SAMPLES = 4  # of the tool's path in one distance
 BESIDE = 1e-6  # of the distance: how far beside its boundary the tool has left the surface
 CROSSING_STEPS = 20
+MOST_OF_SAMPLE = 2 * MOST_CREASES + 2  # points of the path that one position of the tip may add
 
 
 @njit(cache=True)
@@ -47,7 +50,7 @@ def _apart(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def append(k, point, tip, triangle, over):  # type: ignore[no-untyped-def]  # pragma: no cover
+def append(k, point, tip, triangle, over, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Append a position of the tip and the point beneath it to the path, unless the point is the last one."""
     m = k.whole[COUNT]
     if m:
@@ -57,16 +60,21 @@ def append(k, point, tip, triangle, over):  # type: ignore[no-untyped-def]  # pr
         k.length[m] = k.length[m - 1] + step
     else:
         k.length[m] = 0.0
+    size = max(np.sqrt(dot(*normal, *normal)), 1e-300)
     for i in range(3):
-        k.points[m, i], k.tips[m, i] = point[i], tip[i]
+        k.points[m, i], k.tips[m, i], k.normals[m, i] = point[i], tip[i], normal[i] / size
+    k.folds[m] = 0 if m < 2 else k.folds[m - 1] + folded((k.normals[m - 1, 0], k.normals[m - 1, 1], k.normals[m - 1, 2]), normal)
     k.triangle[m], k.over[m] = triangle, over
     k.whole[COUNT] = m + 1
 
 
 @njit(cache=True)
-def sample(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Append a position of the tip and the point of the surface beneath it, searched from a triangle (-1: everywhere)."""
-    distance, reach, point = k.real[DISTANCE], k.real[REACH], np.empty(3)
+def _beneath(s, k, grid, tip, near, point):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Triangle beneath a position of the tip, searched from one nearby (-1: everywhere), and where the tip is, as in `ToolArrays.over`.
+
+    Also the square of its distance, and the point beneath is written to `point`.
+    """
+    distance, reach = k.real[DISTANCE], k.real[REACH]
     radius = 2.0 * distance + k.real[HEIGHT]
     t, beside, d2 = max(near, 0), 0.0, np.inf
     if near >= 0:
@@ -75,27 +83,60 @@ def sample(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no
         found = nearest_listed(s, grid, tip[0], tip[1], tip[2], reach)
         if found >= 0:
             t, beside, d2, _ = nearest(s, found, tip, radius, True, k.queue, point)
-    if beside > BESIDE * distance or d2 > reach * reach:
-        k.real[HEIGHT] = 0.0
-        append(k, tip, tip, t, 0)
-    else:
-        k.real[HEIGHT] = np.sqrt(d2)
-        append(k, point, tip, t, RIM if beside >= 0.0 else INSIDE)
+    return t, 0 if beside > BESIDE * distance or d2 > reach * reach else RIM if beside >= 0.0 else INSIDE, d2
 
 
 @njit(cache=True)
-def _crossing(s, k, i, q, point):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Write to q where the path comes over the surface between its points i - 1 and i, by bisection."""
-    outside, middle = k.points[i - 1].copy(), np.empty(3)
-    q[:] = k.points[i]
-    for _ in range(CROSSING_STEPS):
+def sample(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Append a position of the tip and the point of the surface beneath it, searched from a triangle (-1: everywhere).
+
+    Before it, the point of the boundary over which the tip comes or goes, and those of folds of the surface.
+    """
+    point = np.empty(3)
+    t, over, d2 = _beneath(s, k, grid, tip, near, point)
+    k.real[HEIGHT] = np.sqrt(d2) if over else 0.0
+    last = k.whole[COUNT] - 1
+    if last >= 0 and (over == 0) != (k.over[last] == 0):
+        _append_crossing(s, k, grid, tip, t if over else k.triangle[last])
+    if over:
+        _append_over(s, k, point, tip, t, over)
+    else:
+        append(k, tip, tip, t, 0, normal_of(s.position, s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2]))
+
+
+@njit(cache=True)
+def _append_over(s, k, point, tip, t, over):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Append a position over the surface, and before it the folds between it and the last one."""
+    last = k.whole[COUNT] - 1
+    facing = normal_of(s.position, s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2])
+    if last >= 0 and k.over[last] and k.triangle[last] != t:
+        points, normals = np.empty((MOST_CREASES, 3)), np.empty((MOST_CREASES, 3))
+        count = creases(s, t, point, k.points[last], k.normals[last], k.real[DISTANCE], points, normals)
+        for c in range(count - 1, -1, -1):  # they come from the end; the normals are those of the pieces before
+            append(k, points[c], tip, t, INSIDE, (normals[c, 0], normals[c, 1], normals[c, 2]))
+    append(k, point, tip, t, over, facing)
+
+
+@njit(cache=True)
+def _append_crossing(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Append where the way of the tip from its last position crosses the boundary, by bisection: the point nearest to it just outside.
+
+    Just inside, another part of the surface may be nearer, where the boundary is that of a fold.
+    """
+    last = k.whole[COUNT] - 1
+    inward = k.over[last] == 0
+    low, high, middle, point = 0.0, 1.0, np.empty(3), np.empty(3)
+    for step in range(CROSSING_STEPS + 1):
+        f = 0.5 * (low + high) if step < CROSSING_STEPS else (low if inward else high)
         for j in range(3):
-            middle[j] = 0.5 * (outside[j] + q[j])
-        _, beside, _, _ = nearest(s, k.triangle[i], middle, k.real[REACH], False, k.queue, point)
-        if beside > BESIDE * k.real[DISTANCE]:
-            outside[:] = middle
+            middle[j] = (1.0 - f) * k.tips[last, j] + f * tip[j]
+        t, over, d2 = _beneath(s, k, grid, middle, near, point)
+        if (over != 0) == inward:
+            high = f
         else:
-            q[:] = middle
+            low = f
+    if d2 <= k.real[REACH] ** 2:
+        _append_over(s, k, point, middle, t, RIM)
 
 
 @njit(cache=True)
@@ -109,9 +150,20 @@ def _ahead(k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
+def _length_beside(s, k, v, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Length of the path beside a vertex, of the pieces that face as a triangle there does if any is near."""
+    p, m, t = s.position, k.whole[COUNT], s.at[v]
+    normal = normal_of(p, s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2])
+    gap, beside = on_side_of_path(k.points, k.length, k.normals, k.folds, m, p[v, 0], p[v, 1], p[v, 2], low, high, normal, normal)
+    if gap <= 0.5 * k.real[DISTANCE]:
+        return beside
+    return on_path(k.points, k.length, m, p[v, 0], p[v, 1], p[v, 2], low, high)[1]
+
+
+@njit(cache=True)
 def _enter(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Find the vertex at which the cut begins, or goes on behind an edge or an earlier cut; returns STEPPED, WAITING or FULL."""
-    whole, real, distance, p = k.whole, k.real, k.real[DISTANCE], s.position
+    whole, real, distance = k.whole, k.real, k.real[DISTANCE]
     target, point = np.empty(3), np.empty(3)
     while True:
         i = _ahead(k, final)
@@ -123,10 +175,11 @@ def _enter(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
         j = i - 1
         while j >= 0 and k.over[j] != 0 and k.length[j] >= real[AT] - distance:
             j -= 1
-        if j >= 0 and k.over[j] == 0 and k.length[j] >= real[AT] - distance:
+        comes = j >= 0 and k.over[j] == 0 and k.length[j] >= real[AT] - distance
+        if comes:
             i, edge = j + 1, True
             k.triangle[i] = nearest(s, k.triangle[i], k.points[i], 2.0 * distance, True, k.queue, point)[0]
-            _crossing(s, k, i, target, point)
+            target[:] = k.points[i]
         low, high = max(real[AT], k.length[i] - 2.0 * distance), k.length[i] + distance
         found = begin(s, k, k.triangle[i], target, low, high, edge, point)
         if found == NO_ROOM:
@@ -135,8 +188,7 @@ def _enter(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
         whole[BEGAN] = 1
         if found >= 0:
             whole[NOW], whole[AT_BOUNDARY] = found, 0
-            beside = on_path(k.points, k.length, whole[COUNT], p[found, 0], p[found, 1], p[found, 2], low, high)[1]
-            real[AT] = max(least, beside)
+            real[AT], real[ENTERED] = max(least, _length_beside(s, k, found, low, high)), k.length[i] if comes else 0.0
             return STEPPED
         real[AT] = max(least, max(real[AT] + 0.1 * distance, k.length[i]))
         whole[LEFT_BEFORE] = 0  # the next try begins inside
@@ -183,7 +235,7 @@ def follow(s, k, grid, goal, again):  # type: ignore[no-untyped-def]  # pragma: 
     tip = np.empty(3)
     while whole[PIECE] <= whole[PIECES]:
         if not whole[SAMPLED]:
-            if whole[COUNT] == len(k.length):
+            if whole[COUNT] + MOST_OF_SAMPLE > len(k.length):
                 return FULL
             for i in range(3):
                 tip[i] = real[BEGIN + i] + whole[PIECE] / whole[PIECES] * (goal[i] - real[BEGIN + i])
@@ -204,4 +256,4 @@ def close(k):  # type: ignore[no-untyped-def]  # pragma: no cover
         return
     k.real[CLOSING] = k.length[last] - 2.0 * distance
     for i in range(1, first_at(k.length, last + 1, 2.0 * distance)):
-        append(k, k.points[i], k.tips[i], k.triangle[i], k.over[i])
+        append(k, k.points[i], k.tips[i], k.triangle[i], k.over[i], (k.normals[i, 0], k.normals[i, 1], k.normals[i, 2]))

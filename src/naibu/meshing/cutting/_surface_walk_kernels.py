@@ -23,20 +23,33 @@ from naibu.meshing.cutting._surface_kernels import (
     size2,
     swap,
 )
-from naibu.meshing.cutting._surface_search_kernels import along, dot, first_at, from_to, nearest, nearest_on_triangle, on_path
+from naibu.meshing.cutting._surface_search_kernels import (
+    along,
+    dot,
+    first_at,
+    folded,
+    from_to,
+    nearest,
+    nearest_on_triangle,
+    normal_of,
+    on_path,
+    on_side_of_path,
+)
 
 WAITING, STEPPED, LEFT, ENDED, STUCK, FULL = 0, 1, 2, 3, 4, 5
 NO_ROOM = -2
 RECENT = 3.0  # distances: length of the latest edges of a cut, onto which it does not turn back
 FINEST = 4  # times that the allowed edge is halved where no edge leads on
+TOO_FLAT = 1e-6  # of the longest edge: height of a triangle
+BESIDE_FOLD = 1e-6  # of the distance
 ONWARD, HARDLY = 0.1, 1e-3  # of an edge: how much further along the path it leads, and where an edge is divided for want of one
 BLUNT = 0.1  # of an edge: its parts are not shorter, where the way through it allows that
 
 # entries of `ToolArrays.whole`: lengths of the path and of the list of cut edges, where the cut is, and how far a movement has come
 COUNT, EDGES, NOW, AT_BOUNDARY, BEGAN, LEFT_BEFORE, FREE, PIECE, PIECES, SAMPLED = range(10)
 # entries of `ToolArrays.real`: distance, reach, length of the path beside the cut, height of the tip, length at which a loop is closed,
-# where the cut left the surface, where a movement began
-DISTANCE, REACH, AT, HEIGHT, CLOSING, LAST, BEGIN = 0, 1, 2, 3, 4, 5, 8
+# where the cut left the surface, where a movement began, length at which the path of the cut came over the boundary
+DISTANCE, REACH, AT, HEIGHT, CLOSING, LAST, BEGIN, ENTERED = 0, 1, 2, 3, 4, 5, 8, 11
 
 
 class ToolArrays(NamedTuple):
@@ -47,6 +60,8 @@ class ToolArrays(NamedTuple):
     tips: FloatArray  # (p, 3) mm
     triangle: IntArray  # (p,) beneath
     over: IntArray  # (p,) 0 beside the surface, INSIDE its boundary, or over its RIM
+    normals: FloatArray  # (p, 3) of the triangle beneath the way there, or nearest to it
+    folds: IntArray  # (p,) number of folds of the surface on the way there
     edges: IntArray  # (k, 2) that were cut, over all paths
     queue: IntArray
     around: IntArray
@@ -70,11 +85,29 @@ def refine_around(s, v, bound, around):  # type: ignore[no-untyped-def]  # pragm
 
 
 @njit(cache=True)
-def _fits(s, k, r, c, size, least):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the length of the path beside vertex c if the way from r leads on and stays near the path, and -1 otherwise."""
+def _facing(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Vector normal to a triangle; zero, so that all pieces of the path face as it does, where the triangle is too flat to tell."""
+    x, y, z = normal_of(s.position, s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2])
+    return (x, y, z) if np.sqrt(dot(x, y, z, x, y, z)) > TOO_FLAT * size2(s, t) else (0.0, 0.0, 0.0)
+
+
+@njit(cache=True)
+def _fits(s, k, r, c, t, u, size, least, back):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the length of the path beside vertex c if the way from r leads on and stays near the path, and -1 otherwise.
+
+    Near are those pieces of the path that face as triangle t does beside the way, or u on its other side, which may be none. On the way
+    `back` to a point of the path, it leads on if c is nearer to that.
+    """
     p, m, at, distance = s.position, k.whole[COUNT], k.real[AT], k.real[DISTANCE]
-    high = at + 3.0 * max(size, distance)
-    gap, reached = on_path(k.points, k.length, m, p[c, 0], p[c, 1], p[c, 2], at, high)
+    low, high = at - distance if back else at, at + 3.0 * max(size, distance)
+    one = _facing(s, t)
+    two = one if u < 0 else _facing(s, u)
+    gap, reached = on_side_of_path(k.points, k.length, k.normals, k.folds, m, p[c, 0], p[c, 1], p[c, 2], low, high, one, two)
+    if folded(one, two):  # on a fold, what lies behind it is not reached before the fold is
+        for facing in (one, two):
+            there, first = on_side_of_path(k.points, k.length, k.normals, k.folds, m, p[c, 0], p[c, 1], p[c, 2], low, high, facing, facing)
+            if there <= 0.5 * distance and first < reached:
+                gap, reached = there, first
     onward = reached > at + least * size
     if k.length[m - 1] - at < distance:
         nearer = _from_end2(s, k, c) < _from_end2(s, k, r)
@@ -84,7 +117,7 @@ def _fits(s, k, r, c, size, least):  # type: ignore[no-untyped-def]  # pragma: n
             x, y, z = from_to(p, r, c)
             ax, ay, az = from_to(k.points, m - 2, m - 1)
             onward = dot(x, y, z, ax, ay, az) > least * size * (k.length[m - 1] - k.length[m - 2])
-    if not onward:
+    if not (_nearer(s, k, r, c, max(least * size, HARDLY * distance)) if back else onward):
         return -1.0
     if k.whole[FREE]:
         return reached
@@ -92,10 +125,27 @@ def _fits(s, k, r, c, size, least):  # type: ignore[no-untyped-def]  # pragma: n
         return -1.0
     x, y, z = from_to(p, r, c)
     for i in range(1, 4):
-        f = 0.25 * i
-        if on_path(k.points, k.length, m, p[r, 0] + f * x, p[r, 1] + f * y, p[r, 2] + f * z, at, high)[0] > 0.5 * distance:
+        qx, qy, qz = p[r, 0] + 0.25 * i * x, p[r, 1] + 0.25 * i * y, p[r, 2] + 0.25 * i * z
+        if on_side_of_path(k.points, k.length, k.normals, k.folds, m, qx, qy, qz, low, high, one, two)[0] > 0.5 * distance:
             return -1.0
-    return reached
+    return at if back else reached
+
+
+@njit(cache=True)
+def _folds_near(k, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether the path crosses a fold between two lengths."""
+    m = k.whole[COUNT]
+    i, j = first_at(k.length, m, low), first_at(k.length, m, high)
+    return k.folds[min(max(i, 1), m - 1)] != k.folds[min(j + 1, m - 1)]
+
+
+@njit(cache=True)
+def _nearer(s, k, r, c, least):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether vertex c is nearer than r to the point of the path beside the cut."""
+    x, y, z = along(k.points, k.length, k.whole[COUNT], k.real[AT])
+    p = s.position
+    rx, ry, rz, cx, cy, cz = p[r, 0] - x, p[r, 1] - y, p[r, 2] - z, p[c, 0] - x, p[c, 1] - y, p[c, 2] - z
+    return np.sqrt(dot(cx, cy, cz, cx, cy, cz)) < np.sqrt(dot(rx, ry, rz, rx, ry, rz)) - least
 
 
 @njit(cache=True)
@@ -103,7 +153,7 @@ def _leaves(s, k, r):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether the path leaves the surface within two distances ahead of the cut, as far as it is known."""
     m, at = k.whole[COUNT], k.real[AT]
     j = first_at(k.length, m, at)
-    while j < m and k.over[j] != INSIDE and on_edge_of(s, r) == RIM:
+    while j < m and (k.length[j] <= k.real[ENTERED] or (k.over[j] != INSIDE and on_edge_of(s, r) == RIM)):
         j += 1  # it has just come over the surface
     while j < m and k.length[j] <= at + 2.0 * k.real[DISTANCE]:
         if k.over[j] != INSIDE:
@@ -141,7 +191,7 @@ def _from_end2(s, k, v):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 
 @njit(cache=True)
-def _best(s, k, r, across, anywhere):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _best(s, k, r, across, anywhere, back):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vertex whose edge lies closest to the direction of the path, -1 if none, its triangle, corner and kind, and the length beside it.
 
     On the boundary of the surface only where the path leaves it there, on a lip only of an earlier cut, unless `anywhere`.
@@ -154,9 +204,11 @@ def _best(s, k, r, across, anywhere):  # type: ignore[no-untyped-def]  # pragma:
         i = corner(s, t, r)
         u = s.neighbours[t, i]
         for kind in range(3 if across and u >= 0 else 2):
+            w = u
             if kind < 2:
                 c = s.triangles[t, (i + 1 + kind) % 3]
-                if s.neighbours[t, (i + 2 - kind) % 3] < 0:
+                w = s.neighbours[t, (i + 2 - kind) % 3]
+                if w < 0:
                     continue  # along a boundary there is nothing to part
             else:
                 j = 0
@@ -165,11 +217,11 @@ def _best(s, k, r, across, anywhere):  # type: ignore[no-untyped-def]  # pragma:
                 c = s.triangles[u, j]
             x, y, z = from_to(p, r, c)
             size = np.sqrt(dot(x, y, z, x, y, z))
-            ax, ay, az = along(k.points, k.length, m, at + max(size, 0.5 * k.real[DISTANCE]))
+            ax, ay, az = along(k.points, k.length, m, at if back else at + max(size, 0.5 * k.real[DISTANCE]))
             ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
             cosine = dot(x, y, z, ax, ay, az) / max(size * np.sqrt(dot(ax, ay, az, ax, ay, az)), 1e-300)
             if cosine > best + (1e-9 if kind == 2 else 0.0):
-                behind = _fits(s, k, r, c, size, ONWARD)
+                behind = _fits(s, k, r, c, t, w, size, ONWARD, back)
                 if behind >= 0.0 and (anywhere or _may_end_at(s, k, r, c)):
                     best, reached = cosine, behind
                     found, beside, which, how = c, t, i, kind
@@ -177,46 +229,76 @@ def _best(s, k, r, across, anywhere):  # type: ignore[no-untyped-def]  # pragma:
 
 
 @njit(cache=True)
-def _next(s, k, r, anywhere):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _next(s, k, r, anywhere, back):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Neighbour of a vertex, or the one across the longest edge of a triangle around it, closest to the path's direction; -1 if none."""
-    found, t, i, kind, reached = _best(s, k, r, True, anywhere)
+    found, t, i, kind, reached = _best(s, k, r, True, anywhere, back)
     if found >= 0 and kind == 2 and not swap(s, t, i):
-        found, t, i, kind, reached = _best(s, k, r, False, anywhere)
+        found, t, i, kind, reached = _best(s, k, r, False, anywhere, back)
     return found, reached
 
 
 @njit(cache=True)
-def _ahead_of(s, k, r):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Triangle around a vertex through which the straight way back to the path leads, the vertex's corner, and the share of its edge."""
-    count, _ = fan(s, r, k.around)
-    p, t, i, share, best = s.position, -1, 0, 0.5, 0.0
-    ax, ay, az = along(k.points, k.length, k.whole[COUNT], k.real[AT] + 0.5 * k.real[DISTANCE])
-    ax, ay, az = ax - p[r, 0], ay - p[r, 1], az - p[r, 2]
-    for h in range(count):
-        u = k.around[h]
-        j = corner(s, u, r)
-        b, c = s.triangles[u, (j + 1) % 3], s.triangles[u, (j + 2) % 3]
-        bx, by, bz = from_to(p, r, b)
-        cx, cy, cz = from_to(p, r, c)
-        bb, bc, cc = dot(bx, by, bz, bx, by, bz), dot(bx, by, bz, cx, cy, cz), dot(cx, cy, cz, cx, cy, cz)
-        ab, ac, det = dot(ax, ay, az, bx, by, bz), dot(ax, ay, az, cx, cy, cz), bb * cc - bc * bc
-        if det <= 0.0:
-            continue
-        g, f = (cc * ab - bc * ac) / det, (bb * ac - bc * ab) / det  # the way in the plane of the triangle
-        if f < 0.0:
-            g, f = ab / bb, 0.0
-        elif g < 0.0:
-            g, f = 0.0, ac / cc
-        gain = g * ab + f * ac  # square of its part within the triangle
-        if g >= 0.0 and f >= 0.0 and gain > best:
-            t, i, share, best = u, j, f / (g + f), gain
-    return t, i, share
+def _next_fold(k):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Length of the path at the next fold ahead of the cut, or at its end."""
+    m = k.whole[COUNT]
+    j = max(1, first_at(k.length, m, k.real[AT] + BESIDE_FOLD * k.real[DISTANCE]))
+    while j + 1 < m and k.folds[j + 1] == k.folds[j]:
+        j += 1
+    return k.length[min(j, m - 1)]
 
 
 @njit(cache=True)
-def _divided(s, k, r, anywhere):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _ahead_of(s, k, r, back):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Triangle around a vertex through which the straight way back to the path leads, the vertex's corner, and the share of its edge.
+
+    Of those triangles that face as the path does there, no farther than the next fold; where none does, behind it, or anywhere. On the way
+    `back` to its point beside the cut, the way there.
+    """
+    count, _ = fan(s, r, k.around)
+    m, now, far = k.whole[COUNT], k.real[AT], k.real[AT] + 0.5 * k.real[DISTANCE]
+    for h in range(3):
+        at = now if back else min(far, _next_fold(k)) if h == 0 else far
+        facing = k.normals[min(max(first_at(k.length, m, at), 1), m - 1)]
+        t, i, share, best = -1, 0, 0.5, 0.0
+        ax, ay, az = along(k.points, k.length, m, at)
+        for g in range(count):
+            nx, ny, nz = normal_of(s.position, s.triangles[k.around[g], 0], s.triangles[k.around[g], 1], s.triangles[k.around[g], 2])
+            if h < 2 and not back and dot(nx, ny, nz, facing[0], facing[1], facing[2]) < 0.0:
+                continue
+            corner_there, share_there, gain = _through(s, r, k.around[g], ax, ay, az)
+            if gain > best:
+                t, i, share, best = k.around[g], corner_there, share_there, gain
+        if t >= 0:
+            return t, i, share
+    return -1, 0, 0.5
+
+
+@njit(cache=True)
+def _through(s, r, u, qx, qy, qz):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Corner of a triangle that a vertex is, the share of the edge opposite where the way to q leads over it, and its square within."""
+    p, j = s.position, corner(s, u, r)
+    b, c = s.triangles[u, (j + 1) % 3], s.triangles[u, (j + 2) % 3]
+    ax, ay, az = qx - p[r, 0], qy - p[r, 1], qz - p[r, 2]
+    bx, by, bz = from_to(p, r, b)
+    cx, cy, cz = from_to(p, r, c)
+    bb, bc, cc = dot(bx, by, bz, bx, by, bz), dot(bx, by, bz, cx, cy, cz), dot(cx, cy, cz, cx, cy, cz)
+    ab, ac, det = dot(ax, ay, az, bx, by, bz), dot(ax, ay, az, cx, cy, cz), bb * cc - bc * bc
+    if det <= 0.0:
+        return j, 0.5, 0.0
+    g, f = (cc * ab - bc * ac) / det, (bb * ac - bc * ab) / det  # the way in the plane of the triangle
+    if f < 0.0:
+        g, f = ab / bb, 0.0
+    elif g < 0.0:
+        g, f = 0.0, ac / cc
+    if g < 0.0 or f < 0.0 or g + f <= 0.0:
+        return j, 0.5, 0.0
+    return j, f / (g + f), g * ab + f * ac
+
+
+@njit(cache=True)
+def _divided(s, k, r, anywhere, back):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vertex that divides an edge where the straight way back to the path crosses it, and the length beside it; -1 if none."""
-    t, i, exact = _ahead_of(s, k, r)
+    t, i, exact = _ahead_of(s, k, r, back)
     if t < 0:
         return -1, -1.0
     b, c, new = s.triangles[t, (i + 1) % 3], s.triangles[t, (i + 2) % 3], s.n[0]
@@ -224,7 +306,7 @@ def _divided(s, k, r, anywhere):  # type: ignore[no-untyped-def]  # pragma: no c
         for h in range(3):
             s.position[new, h] = (1.0 - share) * s.position[b, h] + share * s.position[c, h]
         x, y, z = from_to(s.position, r, new)
-        reached = _fits(s, k, r, new, np.sqrt(dot(x, y, z, x, y, z)), HARDLY)
+        reached = _fits(s, k, r, new, t, -1, np.sqrt(dot(x, y, z, x, y, z)), HARDLY, back)
         if reached >= 0.0 and (anywhere or s.neighbours[t, i] >= 0 or (s.neighbours[t, i] == -1 and _leaves(s, k, r))):
             divide(s, t, i, share)
             return new, reached
@@ -248,13 +330,19 @@ def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
             return FULL
         if not has_room(s):
             return FULL
-        c, reached = _next(s, k, r, free)
+        c, reached = _next(s, k, r, free, False)
+        at, reach = k.real[AT], distance if h == FINEST else BESIDE_FOLD * distance
+        back = _folds_near(k, at - reach, at + reach)  # which it may have to come to before it leads on
+        if c < 0 and back:
+            c, reached = _next(s, k, r, free, True)
         if c < 0 and not free and h == FINEST:
-            c, reached = _divided(s, k, r, False)
+            c, reached = _divided(s, k, r, False, False)
+            if c < 0 and back:
+                c, reached = _divided(s, k, r, False, True)
             if c < 0:
-                c, reached = _next(s, k, r, True)
+                c, reached = _next(s, k, r, True, False)
             if c < 0:
-                c, reached = _divided(s, k, r, True)
+                c, reached = _divided(s, k, r, True, False)
         if c >= 0:
             ends_here = on_boundary(s, c, k.around)
             if not separate(s, r, c):

@@ -117,7 +117,7 @@ class SurfaceCutter:
             full = min(len(s.at) - int(s.n[0]), len(s.parent) - int(s.n[1])) < ROOM
             if full:
                 self.arrays = SurfaceArrays(*[*(_grown(a, len(a)) for a in s[:-1]), s.n])
-            self._grow_tool(int(k.whole[walk.COUNT]) + 1)
+            self._grow_tool(int(k.whole[walk.COUNT]) + tool_kernels.MOST_OF_SAMPLE)
             if not full and self._tool.edges is k.edges and self._tool.length is k.length:
                 raise InputError(f"the surface has a vertex with more than {MOST_AROUND} triangles; remesh it")
 
@@ -125,9 +125,9 @@ class SurfaceCutter:
         """Make room for so many points of the path, and for further edges."""
         k = self._tool
         more = max(0, points - len(k.length), len(k.length) if points > len(k.length) else 0)
-        path: list[Any] = [_grown(a, more) if more else a for a in k[:5]]
+        path: list[Any] = [_grown(a, more) if more else a for a in k[:7]]
         edges = _grown(k.edges, len(k.edges)) if 2 * self.n_steps > len(k.edges) else k.edges
-        self._tool = ToolArrays(*[*path, edges, *k[6:]])
+        self._tool = ToolArrays(*[*path, edges, *k[8:]])
 
 
 def cut_surface(
@@ -179,11 +179,12 @@ def _tool(distance_mm: float, reach_mm: float, refined: bool) -> ToolArrays:
     def whole(*shape: int) -> IntArray:
         return np.zeros(shape, dtype=np.int64)
 
-    numbers, real = whole(walk.SAMPLED + 1), np.zeros(walk.BEGIN + 3)
+    numbers, real = whole(walk.SAMPLED + 1), np.zeros(walk.ENTERED + 1)
     numbers[walk.FREE], real[walk.DISTANCE], real[walk.REACH] = not refined, distance_mm, reach_mm
     tool = ToolArrays(
-        np.zeros((ROOM, 3)), np.zeros(ROOM), np.zeros((ROOM, 3)), whole(ROOM), whole(ROOM), whole(ROOM, 2), whole(QUEUE),
-        whole(MOST_AROUND), numbers, real,
+        np.zeros((ROOM, 3)), np.zeros(ROOM), np.zeros((ROOM, 3)), whole(ROOM), whole(ROOM), np.zeros((ROOM, 3)), whole(ROOM),
+        whole(ROOM, 2),
+        whole(QUEUE), whole(MOST_AROUND), numbers, real,
     )  # fmt: skip
     _put_down(tool)
     return tool
@@ -192,7 +193,7 @@ def _tool(distance_mm: float, reach_mm: float, refined: bool) -> ToolArrays:
 def _put_down(tool: ToolArrays) -> None:
     """Set the state of a tool that begins another cut."""
     tool.whole[[walk.COUNT, walk.AT_BOUNDARY, walk.BEGAN, walk.LEFT_BEFORE]] = 0
-    tool.whole[walk.NOW], tool.real[walk.AT], tool.real[walk.CLOSING] = -1, 0.0, np.inf
+    tool.whole[walk.NOW], tool.real[[walk.AT, walk.ENTERED]], tool.real[walk.CLOSING] = -1, 0.0, np.inf
 
 
 def _arrays(start: LinkedSurface) -> SurfaceArrays:
