@@ -19,6 +19,7 @@ from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 from naibu.imaging.volume_correlation.settings import CorrelationSettings
+from naibu.validation.specimens.swollen_body import SwollenSphere, swollen_body
 
 Array = np.ndarray
 SIZE, RADIUS, BLOCK = 64, 25.0, 24
@@ -104,6 +105,22 @@ def test_a_given_mask_gives_what_it_gives_in_memory() -> None:
     assert off[both].mean() < 0.01 and off[both & ~inside(1.0)].mean() < 0.02
     assert (off[both] < stated).mean() > 0.998 and (off[both] < 2.0 * stated).mean() > 0.999
     assert 0.85 < np.median(sd[both] / stated) < 1.3
+
+
+def test_a_part_that_swells_is_found_as_in_memory() -> None:
+    part = SwollenSphere((24.0, 29.5, 25.5), 12.0, 1.15)
+    body = swollen_body([part], seed=1, noise=20.0)
+    mask = body.before.with_values(body.mask.astype(np.uint8))
+    whole = correlate_volumes(body.before, body.after, mask=body.mask)
+    scanned = (ChunkedVolume.of(v) for v in (body.before, body.after))
+    found = correlate_blocks(*scanned, mask=ChunkedVolume.of(mask), factor=1, edge=32)
+    core = np.linalg.norm(positions(mask) - np.array(part.middle_mm), axis=-1) < 0.6 * part.radius_mm
+    swollen = [np.linalg.det(np.eye(3) + r.gradient()[core & r.valid]).mean() for r in (whole, found.result)]
+    assert swollen[1] == pytest.approx(swollen[0], abs=0.02) and min(swollen) > 1.09
+    off = (found.result.displacement.vectors - whole.displacement.vectors)[whole.valid & found.result.valid]
+    assert np.linalg.norm(off, axis=-1).mean() < 0.04
+    own = [r.dilatation < 0.1 * np.nanmax(r.dilatation) for r in (whole, found.result)]
+    assert (own[0] & own[1]).sum() > 0.8 * own[0].sum()
 
 
 def test_standard_deviations_cover_the_truth() -> None:

@@ -24,6 +24,7 @@ from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import lagged_products
 from naibu.imaging.volume_correlation.results.block_displacements import DRAWS, RIM, BlockSums, below_surface, sums_of_blocks
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+from naibu.imaging.volume_correlation.volume_changes import DRAWS as NOISE_DRAWS
 
 Stage = Literal["noise", "step", "covariance"]
 # absolute residuals, in residual SD, between which they are counted for their median: 900 classes, of 2 % each
@@ -57,7 +58,7 @@ class FieldState:
     lagged : bool
         Whether products of residuals by distance are wanted.
     tiles : NoiseTiles, optional
-        From which they are drawn; without them residuals are independent.
+        From which they are drawn, in a step some more than `draws`; without them residuals are independent.
     seed : int
         Of these.
     """
@@ -310,16 +311,24 @@ def _moments(fit: CorrelationFit) -> FloatArray:
 
 
 def _random_loads(fit: CorrelationFit, mask: BoolArray, state: FieldState, block: Block) -> Float32Array:
-    """Return loads (k, 3, s) of random residuals."""
+    """Return loads (k, 3, s) of random residuals: independent ones, or those of tiles; in a step of both, one after the other."""
+    loads = [_independent_loads(fit, mask, state, block)] if state.tiles is None or state.stage == "step" else []
+    if state.tiles is not None:
+        tiles, count = state.tiles, NOISE_DRAWS if state.stage == "step" else state.draws
+        random = (tiles.window(mask, block.number, k) for k in range(count))
+        loads.append(fit.system.random_loads(fit.gradient * np.sqrt(fit.weight)[:, None], random))
+    return np.concatenate(loads, axis=2)
+
+
+def _independent_loads(fit: CorrelationFit, mask: BoolArray, state: FieldState, block: Block) -> Float32Array:
     rng, level = np.random.default_rng((state.seed, block.number)), fit.level
-    # where residuals are independent, some hundred voxels of a cell have loads distributed as those of all
-    share = 1.0 if state.tiles else min(1.0, ENOUGH_IN_CELL / float(np.prod(fit.system.grid.step_mm / level.spacing)))
+    # some hundred voxels of a cell have loads distributed as those of all
+    share = min(1.0, ENOUGH_IN_CELL / float(np.prod(fit.system.grid.step_mm / level.spacing)))
     some = rng.random(len(fit.weight)) < share if share < 1.0 else np.ones(len(fit.weight), dtype=bool)
     number = np.full(mask.shape, -1, np.int32)
     number[tuple(a[some] for a in np.nonzero(mask))] = np.arange(int(some.sum()))
     sensitivity = fit.gradient[some] * np.sqrt(fit.weight[some] / np.float32(share))[:, None]
-    tiles, draws = state.tiles, range(state.draws)
-    random = (tiles.window(mask, block.number, k) if tiles else rng.standard_normal(len(sensitivity), dtype=np.float32) for k in draws)
+    random = (rng.standard_normal(len(sensitivity), dtype=np.float32) for _ in range(state.draws))
     return fit.system.random_loads(sensitivity, random, number)
 
 

@@ -20,15 +20,13 @@ from naibu.imaging.large_volumes.noise_tiles import NoiseTiles
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.object_mask import object_threshold
 from naibu.imaging.volume_correlation._spline_kernels import product
-from naibu.imaging.volume_correlation.common_content import content_of
+from naibu.imaging.volume_correlation.common_content import content_of, require_convergence, require_overlap
 from naibu.imaging.volume_correlation.correlate import (
     ADAPTATION_SAMPLES,
     ADAPTATIONS,
     LEVELS,
     UNSETTLED,
     Correlation,
-    require_convergence,
-    require_overlap,
 )
 from naibu.imaging.volume_correlation.gauss_newton import SAMPLE_TOLERANCE, SAMPLES_AT_ONCE, STEP_TOLERANCE, STILL
 from naibu.imaging.volume_correlation.image_level import GAIN_RANGE, GainMap, most_probable_gain
@@ -49,10 +47,12 @@ class Model:
     ----------
     coefficients : ndarray, shape (NZ, NY, NX, 3)
         Of the displacement, mm.
-    bending, dilatation : ndarray, shape (m, 3), and float
+    bending, dilatation : ndarray, shape (m, 3) and (m,)
         Weights of the penalties.
     gain, residual_sd, jitter_voxels, reliability
         See `FieldState`; the reliability is that of the m cells.
+    lowest : ndarray, shape (m,)
+        What the weights of dilatation might have to be, where the data do not decide on volume; infinite elsewhere.
     products, pairs : ndarray, optional
         Sums of products of residuals, and their numbers, by distance.
     passes : int
@@ -63,11 +63,12 @@ class Model:
 
     coefficients: FloatArray
     bending: FloatArray
-    dilatation: float
+    dilatation: FloatArray
     gain: FloatArray
     residual_sd: float
     jitter_voxels: float
     reliability: Float32Array
+    lowest: FloatArray
     products: AnyFloatArray | None = None
     pairs: AnyFloatArray | None = None
     passes: int = 0
@@ -100,7 +101,7 @@ class SummedEquations:
         reliability = fit.reliability_of(fit.cell_agreement())
         self.model = Model(
             coarse.c, coarse.bending, coarse.dilatation, self._gain(matrix, load, fit.residual_sd, everywhere), fit.residual_sd,
-            coarse.settings.jitter_sd_voxels, reliability,
+            coarse.settings.jitter_sd_voxels, reliability, coarse.lowest,
         )  # fmt: skip
 
     def _frame(self, factor: int) -> BlockFrame:
@@ -144,9 +145,9 @@ class SummedEquations:
         dense[tuple(self.system.cells[:, 2:].T)] = model.reliability
         draws = {"noise": 0, "step": ADAPTATION_SAMPLES if adapted else 0, "covariance": self.coarse.settings.samples}[stage]
         tiles = None
-        if stage == "covariance" and model.products is not None and model.pairs is not None:
+        if (stage == "covariance" or adapted) and model.products is not None and model.pairs is not None:
             tiles = NoiseTiles.for_blocks(edges, seed, model.products, model.pairs)
-        lagged = stage == "step" and model.passes + 1 >= LEAST_PASSES
+        lagged = stage == "step" and (model.passes + 1 >= LEAST_PASSES or (self.adapting and model.passes + 1 == ADAPTED_PASS - 1))
         return FieldState(
             stage, model.coefficients, model.gain, model.residual_sd, model.jitter_voxels, dense, draws, lagged, tiles, seed + model.passes
         )
@@ -168,6 +169,7 @@ class SummedEquations:
         sums, coarse = self._added(blocks), self.coarse
         before, passes = self.model.coefficients, self.model.passes + 1
         coarse.c, coarse.bending, coarse.dilatation = before.copy(), self.model.bending, self.model.dilatation
+        coarse.lowest = self.model.lowest
         self._settle(sums, before)
         if self.adapting and passes == ADAPTED_PASS:
             self._adapt(sums, before)
@@ -178,7 +180,7 @@ class SummedEquations:
             jitter = self.fit.bounded_jitter(float(np.sqrt(sums.jitter / sums.seen)))
         return replace(
             self._with_intensities(sums), jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending,
-            dilatation=coarse.dilatation, passes=passes,
+            dilatation=coarse.dilatation, lowest=coarse.lowest, passes=passes,
             settled=passes >= LEAST_PASSES and self.fit.moving_fraction <= UNSETTLED, products=sums.products, pairs=sums.pairs,
         )  # fmt: skip
 
@@ -199,13 +201,17 @@ class SummedEquations:
         self._settle(sums, before, 2)
         self._take_step(before)
         require_convergence(fit.moving_fraction)
+        coarse.lowest = self.model.lowest
+        loose = coarse.loosened(lambda: self._assembled(sums, before))
+        self._assembled(sums, before)
         scale = lost_to_robustness(*sums.robust)
         samples = self._samples(np.float32(scale) * sums.draws, seed=coarse.settings.seed + 1)
         self.system.warped(coarse.c, fit.value, fit.reference_gradient, fit.gradient, fit.displacement)
         model = self._with_intensities(sums)
         fit.gain, fit.offset = self.lattice.values(model.gain)
         fit.residual_sd = model.residual_sd
-        found = collected(coarse.volume, fit, coarse.c, samples, coarse.bending, coarse.dilatation, content.matched, sums.misfit)
+        weights = coarse.bending, coarse.dilatation
+        found = collected(coarse.volume, fit, coarse.c, samples, *weights, content.matched, sums.misfit, loose)
         return replace(found, blocks=self._small_blocks(sums.small, scale) if sums.small else None)
 
     def _small_blocks(self, parts: list[BlockSums], scale: float) -> DisplacementField:
@@ -216,11 +222,19 @@ class SummedEquations:
 
     def _adapt(self, sums: _Sums, before: FloatArray) -> None:
         """Choose the weights of the penalties as in memory."""
-        coarse = self.coarse
+        coarse, drawn = self.coarse, np.float32(lost_to_robustness(*sums.robust)) * sums.draws[:, :, ADAPTATION_SAMPLES:]
+        self._assembled(sums, before)
+        self.fit.residual_sd = self.model.residual_sd
+        if drawn.shape[2]:
+            coarse.release(
+                sums.misfit,
+                lambda: self.system.solved_many(drawn, SAMPLE_TOLERANCE)[0],
+                lambda: self._settle(sums, before, 2),
+            )
         for _ in range(ADAPTATIONS):
             # the energies of the field, to which those of the samples are compared
             self._assembled(sums, before)
-            settled = coarse.reweigh(self._samples(sums.draws))
+            settled = coarse.reweigh(self._samples(sums.draws[:, :, :ADAPTATION_SAMPLES]))
             self._settle(sums, before, 2)
             if settled:
                 break

@@ -32,6 +32,9 @@ WINDOWS = (1.0, 2.0, 4.0)  # cells: SDs of the windows in which a cell is judged
 SURFACE = 1.5  # cells: depth below which a voxel may show the contrast of the surface
 LEAST_VOXELS = 40  # of the inside of the object in a window; thinner objects are judged by their surface, too
 
+MOST_MOVING = 0.33  # fraction of the cells that have not converged, above which nothing was found: 0.7 in legs of two persons
+LEAST_OVERLAP = 0.05  # fraction of the object in the deformed volume after its motion, below which the volumes do not overlap
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CommonContent:
@@ -138,3 +141,33 @@ def _lagged(fit: CorrelationFit, residual: Float32Array) -> Float32Array:
         here, there = (tuple(s if a == axis else slice(None) for a in range(3)) for s in (slice(None, -LAG), slice(LAG, None)))
         total[here] += box[here] * box[there] / len(axes)
     return np.asarray(total[fit.level.mask])
+
+
+def require_overlap(seen: float) -> None:
+    """Refuse an object of which only a small fraction is seen in the deformed volume.
+
+    Raises
+    ------
+    InputError
+        Such an object.
+    """
+    if seen < LEAST_OVERLAP:
+        raise InputError(
+            f"only {seen:.1%} of the object lies in the deformed volume after its motion: the volumes do not overlap, or do not show the "
+            "same object"
+        )
+
+
+def require_convergence(moving: float) -> None:
+    """Refuse a field of which so many cells still moved in the last step that nothing was found.
+
+    Raises
+    ------
+    InputError
+        Such a field.
+    """
+    if moving > MOST_MOVING:
+        raise InputError(
+            f"no displacement fits the volumes: {moving:.0%} of the object had not converged after the last step; check that both show the "
+            "same object, and give masks of it if there is much else in them"
+        )

@@ -14,6 +14,7 @@ the data :cite:p:`mackay1992`. Rigid inclusions have a rigid motion each. Coarse
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,27 +25,41 @@ from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
-from naibu.imaging.preprocessing.field_of_view import Box, fields_of_view, in_box
+from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.resampling import require_mask
-from naibu.imaging.preprocessing.volume_pair import intensity_pair, require_known
-from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated
-from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit, Iterations, cell_kinds, chosen_weights
+from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated, require_convergence, require_overlap
+from naibu.imaging.volume_correlation.gauss_newton import (
+    INSIDE_INCLUSION,
+    STEP_TOLERANCE,
+    CorrelationFit,
+    Iterations,
+    cell_kinds,
+    chosen_weights,
+)
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
 from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
 from naibu.imaging.volume_correlation.results.block_displacements import block_displacements
+from naibu.imaging.volume_correlation.results.cell_errors import misplacement_variance
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.rigid_parts.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion, rigid_inclusions_among
 from naibu.imaging.volume_correlation.rigid_parts.rigid_initialization import RigidInitialization, correlated_shift
 from naibu.imaging.volume_correlation.settings import REFERENCE_FRACTION, CorrelationSettings
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.volume_changes import (
+    DEMANDED,
+    DOUBTED,
+    DRAWS,
+    demanded_dilatation,
+    may_swell,
+    released_weights,
+    squared_dilatation,
+)
+from naibu.imaging.volume_correlation.volumes_and_masks import LEAST_SIZE, check_shape, filled_pair, labelled
 
-LEAST_SIZE = 4  # voxels along an axis: cubic B-splines have four nodes in a cell
-MOST_MOVING = 0.33  # fraction of the cells that have not converged, above which nothing was found: 0.7 in legs of two persons
-LEAST_OVERLAP = 0.05  # fraction of the object in the deformed volume after its motion, below which the volumes do not overlap
 # No derivation stands behind the numbers below: they are empirical, and benchmarks/sense_volumes.py shows the effect of a change.
 VOXELS_PER_LONG_CELL = 2.5  # least number of voxels along a cell on the axis of the largest spacing
 # an affine motion is tried where the outline is stretched by so much, and taken if its correlation is higher by so much
@@ -57,6 +72,7 @@ INCLUSION_SMOOTHING = 0.8  # of both volumes, for rigid inclusions, voxels
 WEIGHT_WINDOW = 1.9  # cells: standard deviation of the window in which cells share a weight
 ADAPTATION_SAMPLES, ADAPTATIONS = 12, 4  # random fields of a round, and rounds, in which the weights are adapted
 INCLUSION_STEPS, ADAPTED_STEPS = 3, 5  # Gauss-Newton steps with rigid inclusions, and after each adaptation
+SEARCHES, RELEASED_STEPS = 2, 2  # for parts that swell, and Gauss-Newton steps after each
 UNSETTLED = 0.05  # fraction of the cells that still move, above which these steps go on: large strains of small volumes need more
 MOST_STIFFER = 2.0  # median factor on the weights of bending, above which they are adapted once more
 # the last steps are solved more exactly: what is left of a step is an error like any other
@@ -161,11 +177,11 @@ class Correlation:
         mask, deformed_mask = masks
         self.mask_given = mask is not None
         self.volume, self.settings, self.progress = reference, settings, progress
-        _check_shape(reference, deformed)
+        check_shape(reference, deformed)
         self.views = fields_of_view(reference, deformed)
         if any(max(a.start, b.start) >= min(a.stop, b.stop) for a, b in zip(*self.views, strict=True)):
             raise InputError("reference and deformed do not overlap: no voxel is known in both; check the transform that registered them")
-        self.reference, self.deformed = _filled_pair(reference, deformed, self.views)
+        self.reference, self.deformed = filled_pair(reference, deformed, self.views)
         self.mask = mask_in_view(reference, self.views[0], margin=1) if mask is None else require_mask(mask, reference)
         self.mask = self.mask & in_box(self.views[0], reference.shape)
         self.deformed_volume = deformed
@@ -203,13 +219,14 @@ class Correlation:
             far=level == 0,
         )
 
-    def weights(self, system: SplineSystem, factor: float) -> tuple[FloatArray, float]:
-        """Return the weights of bending (m, 3) and dilatation that do not depend on the data."""
+    def weights(self, system: SplineSystem, factor: float) -> tuple[FloatArray, FloatArray]:
+        """Return the weights of bending (m, 3) and dilatation (m,) that do not depend on the data."""
         s = self.settings
         first = FIRST_DILATATION if s.adaptive_weight else 1.0
         h = system.grid.step_mm
         bending = np.full((len(system.cells), 3), factor * s.bending_weight / float(np.prod(h) ** (1 / 3)))
-        return bending, first * self.dilatation_factor * s.dilatation_weight / float(np.prod(h)) if s.dilatation_penalty else 0.0
+        dilatation = first * self.dilatation_factor * s.dilatation_weight / float(np.prod(h)) if s.dilatation_penalty else 0.0
+        return bending, np.full(len(system.cells), dilatation)
 
     def initialize(self) -> None:
         """Find the rigid motion, and put it on the coarsest grid."""
@@ -268,7 +285,7 @@ class Correlation:
         if not self.settings.rigid_inclusions:
             return
         size = float(self.step.mean())
-        found = self._candidates(size) if rigid_mask is None else _labelled(rigid_mask, self.volume)
+        found = self._candidates(size) if rigid_mask is None else labelled(rigid_mask, self.volume)
         labels = np.where(self.mask, found, 0).astype(np.int32)
         if not labels.any():
             return
@@ -290,7 +307,11 @@ class Correlation:
         if self.inclusions:
             self.c = fit.iterate(self.c, self.bending, self.dilatation * fit.system.gauss_volume, Iterations(INCLUSION_STEPS))
         self.kinds = cell_kinds(fit)
-        self.most_dilatation = self.dilatation / (FIRST_DILATATION * self.dilatation_factor)
+        # of cells whose volume changes no more than elsewhere
+        self.common_dilatation = float(self.dilatation[0])
+        self.most_dilatation = self.common_dilatation / (FIRST_DILATATION * self.dilatation_factor)
+        # cells with weights of their own, and what the weights of others might have to be
+        self.dilating, self.lowest = np.zeros(len(fit.system.cells), dtype=bool), np.full(len(fit.system.cells), np.inf)
 
     def adapt(self) -> None:
         """Choose the weights of the penalties by the data, and fit once more."""
@@ -299,6 +320,7 @@ class Correlation:
         if not s.adaptive_weight:
             return
         fit.jitter_voxels = fit.bounded_jitter(fit.observed_jitter_voxels)
+        self.release(fit.cell_misfit(), lambda: fit.noise_samples(DRAWS, self.noise(), s.seed), self.settle_released)
         for k in range(ADAPTATIONS):
             report_progress(self.progress, "weights of the penalties", done=k, total=ADAPTATIONS)
             samples = fit.samples(self.c, self.bending, self.dilatation * system.gauss_volume, ADAPTATION_SAMPLES, None, s.seed)
@@ -309,16 +331,67 @@ class Correlation:
                 break
         self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, POLISH)
 
+    def noise(self) -> ResidualNoise:
+        """Return noise like the present residuals."""
+        fit = self.fit
+        return ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), lost_to_robustness(*fit.robust_sums))
+
+    def settle_released(self) -> None:
+        """Fit with the weights of parts that swell."""
+        self.c = self.fit.iterate(self.c, self.bending, self.dilatation * self.fit.system.gauss_volume, Iterations(RELEASED_STEPS))
+
+    def release(self, misfit: FloatArray, noise: Callable[[], Float32Array], settle: Callable[[], None]) -> None:
+        """Find the cells in which the data demand that volume changes by more than elsewhere, and let it.
+
+        `misfit` (m, 3) is that of `CorrelationFit.cell_misfit`. `noise` draws coefficients (n, 3, s) of noise alone, and `settle` fits at
+        the weights that were lowered: what large parts took from their surroundings hid smaller ones.
+        """
+        fit, most = self.fit, self.most_dilatation
+        # jumps where structures slide, or are not in both volumes, are none
+        some = (fit.system.gauss_volume > 0.0) & (self.kinds < INSIDE_INCLUSION) & (misplacement_variance(fit, misfit) == 0.0)
+        for _ in range(SEARCHES):
+            if most == 0.0 or not some.any() or squared_dilatation(fit)[some].max() < 1.0 / most:
+                return
+            demand = demanded_dilatation(fit, noise(), self.c)
+            more = may_swell(fit, some, most) & (demand > DEMANDED) & ~self.dilating
+            lower = released_weights(fit, self.common_dilatation, demand)
+            self.lowest = np.where(some & (demand > DOUBTED), lower, np.inf)
+            if not more.any():
+                return
+            self.dilating |= more
+            self.dilatation = np.where(more, lower, self.dilatation)
+            settle()
+
     def reweigh(self, samples: Float32Array) -> bool:
         """Choose the weights of the penalties given random coefficients (n, 3, s), and return whether another round changes little."""
-        width, before, bent = WEIGHT_WINDOW * float(self.step.mean()), self.dilatation, self.bending
-        self.bending, dilatation = chosen_weights(self.fit, samples, self.c, bent, before, width, self.kinds)
+        fit, common, bent, before = self.fit, self.common_dilatation, self.bending, self.dilatation
+        width = WEIGHT_WINDOW * float(self.step.mean())
+        self.bending, dilatation = chosen_weights(fit, samples, self.c, bent, common, width, self.kinds, self.dilating)
+        # what swells bends about it, more than what it shares its weight with
+        self.bending = np.where(self.dilating[:, None], np.minimum(self.bending, self.weights(fit.system, 1.0)[0]), self.bending)
         if self.settings.dilatation_penalty:
             # never more than assumed: what little volume changes may not be noise alone
-            self.dilatation = float(np.clip(dilatation, LEAST_WEIGHT * before, self.most_dilatation))
+            self.common_dilatation = float(np.clip(dilatation, LEAST_WEIGHT * common, self.most_dilatation))
+            self.dilatation = np.where(self.dilating, np.minimum(before, self.common_dilatation), self.common_dilatation)
         # a field that was penalised too much shows only in part how much volume changes, and one penalised too little has noise that bends
-        stiffer = float(np.median(self.bending[self.fit.system.inner] / bent[self.fit.system.inner]))
-        return self.dilatation > 0.5 * before and stiffer < MOST_STIFFER
+        stiffer = float(np.median(self.bending[fit.system.inner] / bent[fit.system.inner]))
+        return self.common_dilatation > 0.5 * common and stiffer < MOST_STIFFER
+
+    def loosened(self, assemble: Callable[[], Float32Array]) -> Float32Array:
+        """Return how the coefficients (n, 3), mm, would change if volume might where the data do not decide on it.
+
+        `assemble` assembles the equations at the present weights, and returns the right side.
+        """
+        system, kept = self.fit.system, (self.bending, self.dilatation)
+        doubted = self.lowest < self.dilatation
+        if not doubted.any():
+            return np.zeros((system.n, 3), np.float32)
+        # what swells bends about it: the weight that was adapted to a field that keeps its volume would not let it
+        first = np.where(doubted[:, None], self.weights(system, 1.0)[0], np.inf)
+        self.bending, self.dilatation = np.minimum(self.bending, first), np.minimum(self.dilatation, self.lowest)
+        step = system.solved(assemble(), STEP_TOLERANCE)[0]
+        self.bending, self.dilatation = kept
+        return step
 
     def depth_mm(self, level: ImageLevel) -> Float32Array:
         """Return the distance (n,) of the listed voxels of the finest level from the surface, mm; the ends of the volume are none."""
@@ -332,10 +405,14 @@ class Correlation:
         """Draw the covariance, and return the result."""
         report_progress(self.progress, "covariance")
         fit, system = self.fit, self.fit.system
-        dilatation = self.dilatation * system.gauss_volume
         fit.reliability = None
         fit.compare(self.c)
-        fit.system.assembled(self.c, fit.products, fit.force, self.bending, dilatation)
+
+        def assemble() -> Float32Array:
+            return system.assembled(self.c, fit.products, fit.force, self.bending, self.dilatation * system.gauss_volume)
+
+        loose = self.loosened(assemble)
+        assemble()
         require_overlap(float(fit.seen.mean()))
         refuse_unrelated(fit)
         content = common_content(fit, self.depth_mm(fit.level))
@@ -343,66 +420,14 @@ class Correlation:
         require_convergence(fit.moving_fraction)
         for inclusion in self.inclusions:
             inclusion.draws.clear()
-        noise = ResidualNoise(fit.level.mask, fit.residual * np.sqrt(fit.weight), lost_to_robustness(*fit.robust_sums))
-        samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
+        noise = self.noise()
+        samples = fit.samples(
+            self.c, self.bending, self.dilatation * system.gauss_volume, self.settings.samples, noise, self.settings.seed + 1
+        )
         blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2)
         weights = self.bending, self.dilatation
-        return replace(collected(self.volume, fit, self.c, samples, *weights, content.matched, fit.cell_misfit()), blocks=blocks)
-
-
-def require_overlap(seen: float) -> None:
-    """Refuse an object of which only a small fraction is seen in the deformed volume.
-
-    Raises
-    ------
-    InputError
-        Such an object.
-    """
-    if seen < LEAST_OVERLAP:
-        raise InputError(
-            f"only {seen:.1%} of the object lies in the deformed volume after its motion: the volumes do not overlap, or do not show the "
-            "same object"
-        )
-
-
-def require_convergence(moving: float) -> None:
-    """Refuse a field of which so many cells still moved in the last step that nothing was found.
-
-    Raises
-    ------
-    InputError
-        Such a field.
-    """
-    if moving > MOST_MOVING:
-        raise InputError(
-            f"no displacement fits the volumes: {moving:.0%} of the object had not converged after the last step; check that both show the "
-            "same object, and give masks of it if there is much else in them"
-        )
-
-
-def _check_shape(reference: Volume, deformed: Volume) -> None:
-    for name, volume in (("reference", reference), ("deformed", deformed)):
-        if min(volume.shape) < LEAST_SIZE:
-            raise InputError(
-                f"the {name} volume has {' x '.join(map(str, volume.shape[::-1]))} voxels; volume correlation needs {LEAST_SIZE} or more "
-                "along every axis. For an image or a few slices use naibu.imaging.lucas_kanade (method='lucas-kanade')"
-            )
-
-
-def _filled_pair(reference: Volume, deformed: Volume, views: tuple[Box, Box]) -> tuple[Float32Array, Float32Array]:
-    """Return the intensities of both volumes; those outside the fields of view, which are never compared, are the mean of those inside."""
-    filled = [_filled(*each) for each in (("reference", reference, views[0]), ("deformed", deformed, views[1]))]
-    before, after = intensity_pair(*filled)
-    return before, after
-
-
-def _filled(name: str, volume: Volume, view: Box) -> Volume:
-    require_known(volume, view, name)
-    values = np.asarray(volume.values, dtype=np.float32)
-    inside = values[view]
-    if inside.shape != values.shape:
-        values = np.where(in_box(view, values.shape), values, inside.mean(dtype=np.float64).astype(np.float32))
-    return volume.with_values(values)
+        found = collected(self.volume, fit, self.c, samples, *weights, content.matched, fit.cell_misfit(), loose)
+        return replace(found, blocks=blocks)
 
 
 def _step(settings: CorrelationSettings, mask: BoolArray, spacing: FloatArray) -> FloatArray:
@@ -423,13 +448,3 @@ def _strides(step: FloatArray, spacing: FloatArray) -> list[tuple[int, ...]]:
     """Return the strides of all levels, the last of which takes every voxel."""
     fine = [_stride(step, spacing, level.voxels_per_cell) for level in LEVELS[:-1]]
     return fine if max(fine[-1]) == 1 else [*fine, (1, 1, 1)]
-
-
-def _labelled(rigid_mask: ArrayLike, volume: Volume) -> Int32Array:
-    given = np.asarray(rigid_mask)
-    require_mask(given, volume, name="rigid_mask")
-    if given.dtype.kind == "b":
-        return np.asarray(ndimage.label(given)[0], dtype=np.int32)
-    if given.dtype.kind not in "iu":
-        raise InputError(f"rigid_mask must be boolean or hold labels of inclusions, not {given.dtype}")
-    return given.astype(np.int32)

@@ -33,6 +33,7 @@ AGREEMENT_WINDOW = 0.5  # cells: standard deviation of the window in which the g
 LEAST_RELIABILITY = 0.01  # keeps the normal matrix regular where the gradients do not agree at all
 REGULAR = 1e-6  # of the trace: gradients of a cell may all have one direction
 FRESH = 2  # steps at which the reliability of the gradients is estimated anew: it varies little from step to step
+INSIDE_INCLUSION = 2  # kind of cells
 STILL = 0.1  # voxels: step below which a cell has converged
 MOST_STEPS = 25  # by far not converged after so many, a fit never is
 
@@ -205,6 +206,15 @@ class CorrelationFit(IntensityComparison):
             out[:, :, first : first + SAMPLES_AT_ONCE] = self.system.solved_many(loads, SAMPLE_TOLERANCE)[0]
         return out
 
+    def noise_samples(self, count: int, noise: ResidualNoise, seed: int) -> Float32Array:
+        """Return random coefficients (n, 3, count), mm, that residuals of noise alone would leave, at the penalties last assembled."""
+        sensitivity = self.gradient * np.sqrt(self.weight)[:, None]
+        for inclusion in self.inclusions:
+            sensitivity[inclusion.voxels] = 0
+        rng = np.random.default_rng((seed, count))
+        loads = self.system.random_loads(sensitivity, (noise.draw(rng) for _ in range(count)))
+        return self.system.solved_many(loads, SAMPLE_TOLERANCE)[0]
+
     def _random_loads(self, sensitivity: Float32Array, count: int, noise: ResidualNoise | None, rng: np.random.Generator) -> Float32Array:
         held: list[list[FloatArray]] = []
 
@@ -242,7 +252,7 @@ def cell_kinds(fit: CorrelationFit) -> IntArray:
     count = np.bincount(flat, minlength=int(np.prod(shape)))
     fraction = (np.bincount(flat, rigid, minlength=len(count)) / np.maximum(count, 1)).reshape(shape)
     near = ndimage.binary_dilation(fraction > 0, np.ones((3, 3, 3), dtype=bool))
-    return np.asarray(np.where(fraction > 0.95, 2, np.where(near, 1, 0))[tuple(system.cells[:, 2:].T)], dtype=np.int64)
+    return np.asarray(np.where(fraction > 0.95, INSIDE_INCLUSION, np.where(near, 1, 0))[tuple(system.cells[:, 2:].T)], dtype=np.int64)
 
 
 def chosen_weights(
@@ -253,6 +263,7 @@ def chosen_weights(
     dilatation_weight: float,
     width_mm: float,
     kinds: IntArray,
+    dilating: BoolArray,
 ) -> tuple[FloatArray, float]:
     """Return the most probable weights of the bending penalty (m, 3), by cell and axis, and of the dilatation penalty, given the data.
 
@@ -272,6 +283,8 @@ def chosen_weights(
         Standard deviation of the Gaussian window in which cells share a weight, mm.
     kinds : ndarray, shape (m,)
         Only cells of one kind share a weight.
+    dilating : ndarray, shape (m,), bool
+        Cells that do not have the common weight of dilatation.
 
     Notes
     -----
@@ -297,8 +310,9 @@ def chosen_weights(
         common = np.maximum(determined[m].sum(axis=0), LEAST_FRACTION * penalised[m].sum(axis=0)) / np.maximum(energy[m].sum(axis=0), 1e-30)
         common_part = COMMON * windowed(penalised)
         out[m] = (np.maximum(windowed(determined), 0.0) + common_part) / (windowed(energy) + common_part / common)
-    per_cell = system.gauss_volume
-    left = system.n - dilatation_weight * float(per_cell @ dilatation_energy)
+    per_cell = np.where(dilating, 0.0, system.gauss_volume)
+    unknowns = system.n * float(per_cell.sum()) / max(float(system.gauss_volume.sum()), 1e-30)
+    left = unknowns - dilatation_weight * float(per_cell @ dilatation_energy)
     return out, left / max(float(per_cell @ system.dilatation_energy), 1e-30)
 
 

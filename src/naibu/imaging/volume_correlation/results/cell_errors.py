@@ -50,7 +50,7 @@ def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray
     return np.asarray((wide[:, 1:] / wide[:, :1]).reshape(-1, 3, 3))
 
 
-def biases(fit: CorrelationFit, c: FloatArray, bending: FloatArray, dilatation: float) -> tuple[Float32Array, ...]:
+def biases(fit: CorrelationFit, c: FloatArray, bending: FloatArray, dilatation: FloatArray) -> tuple[Float32Array, ...]:
     """Return coefficients (n, 3), mm, as large as the standard deviation along every axis of the bias, for either penalty.
 
     They are what penalising a field once more takes away: see the notes of `collected`.

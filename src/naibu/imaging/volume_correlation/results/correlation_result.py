@@ -53,9 +53,9 @@ class CorrelationResult:
     cell_misplacement : ndarray, shape (CZ, CY, CX)
         Variance along every axis, mm^2, of displacements that would explain residuals far above the noise, a part of the covariance: 0
         where structures lie on one another after registration, NaN where there is no object.
-    bending, dilatation : ndarray, shape (CZ, CY, CX, 3), and float
+    bending, dilatation : ndarray, shape (CZ, CY, CX, 3) and (CZ, CY, CX)
         Weights of the penalties: of squared second derivatives, for each component along the axes of the volume, 1/mm, and of the squared
-        dilatation, 1/mm^3; NaN where there is no object.
+        dilatation, 1/mm^3, less where volume changes by more than elsewhere; NaN where there is no object.
     residual_sd : float
         Standard deviation of the intensity residual, in intensities of the reference.
     gain, offset : ndarray, shape (nz, ny, nx)
@@ -80,7 +80,7 @@ class CorrelationResult:
     cell_bias: FloatArray
     cell_misplacement: FloatArray
     bending: FloatArray
-    dilatation: float
+    dilatation: FloatArray
     residual_sd: float
     gain: Float32Array
     offset: Float32Array
@@ -279,22 +279,24 @@ def collected(
     c: FloatArray,
     samples: Float32Array,
     bending: FloatArray,
-    dilatation: float,
+    dilatation: FloatArray,
     matched: BoolArray,
     misfit: FloatArray,
+    loose: Float32Array,
 ) -> CorrelationResult:
     """Return the result of a fit at full resolution.
 
     `samples` (n, 3, s) are random coefficients about c. Soft cells (m,) that are not matched are not answered. `misfit` (m, 3) is that of
-    `CorrelationFit.cell_misfit` at full resolution.
+    `CorrelationFit.cell_misfit` at full resolution, and `loose` (n, 3), mm, how the coefficients would change if volume might, where the
+    data do not decide on it.
 
     Notes
     -----
     The samples hold the error of fields as rough, and as far from constant volume, as the penalties assume. That of others is a bias, whose
     size is estimated by smoothing the field once more, as in Tukey's twicing :cite:p:`tukey1977`, and by penalising its dilatation once
     more. Its direction is not: what a penalty took from the true field was not parallel to what it takes from its estimate. Both are
-    therefore added as variances along every axis. So is what large residuals tell of
-    structures that no smooth field brings together, such as those on either side of organs that slide on each other.
+    therefore added as variances along every axis. So is what volume might do where the data do not decide on it, and what large
+    residuals tell of structures that no smooth field brings together, such as those on either side of organs that slide on each other.
     """
     system, level = fit.system, fit.level
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
@@ -320,7 +322,7 @@ def collected(
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
         full[~valid] = np.nan
-    bias = biases(fit, c, bending, dilatation)
+    bias = *biases(fit, c, bending, dilatation), loose
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
     misplaced = misplacement_variance(fit, misfit)
     biased = bias_variance(fit, bias)
@@ -330,10 +332,12 @@ def collected(
     strain_sd = np.sqrt(strain_variance(fit, c, samples, bias) + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2)
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
-    of_strain, of_bias, of_place, of_bending = (per_cell(system.grid, fit, values) for values in (strain_sd, biased, misplaced, bending))
+    of_strain, of_bias, of_place, bent, dilated = (
+        per_cell(system.grid, fit, v) for v in (strain_sd, biased, misplaced, bending, dilatation)
+    )
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
-        of_strain, of_bias, of_place, of_bending, dilatation, fit.residual_sd,
+        of_strain, of_bias, of_place, bent, dilated, fit.residual_sd,
         maps[0], maps[1], converged, inclusions, motions, _status(system.grid, volume, converged),
     )  # fmt: skip
 
