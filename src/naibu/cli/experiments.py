@@ -99,7 +99,7 @@ def identify(
     pixel_scale
         Whether the pixel size along x and y is taken from the file (given) or identified for every experiment (sought).
     element_size_mm
-        Edge length of the elements; 0 selects it automatically.
+        Edge length of the elements; 0 selects it automatically, and smaller ones where these would change moduli of fields.
     cross_validate
         Also predict every experiment from the others.
     resume

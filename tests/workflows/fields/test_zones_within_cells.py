@@ -6,13 +6,14 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.core.errors import InputError
+from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.field_estimate import FieldEstimate
@@ -237,3 +238,17 @@ def test_cubes_stay_where_they_limit_nothing_or_can_hardly_be_smaller() -> None:
     assert smaller_size(SIDE_MM**3, cubes.mesh, 10**6) == pytest.approx(4.0)  # half as large at once
     assert smaller_size(SIDE_MM**3, cubes.mesh, 8 * 27) == pytest.approx(SIDE_MM / 6.0)
     assert smaller_size(SIDE_MM**3, cubes.mesh, 150) is None
+
+
+def test_larger_cubes_stand_where_smaller_ones_find_no_equilibrium(monkeypatch: pytest.MonkeyPatch) -> None:
+    def without_equilibrium(*_: object, **__: object) -> FieldEstimate:
+        raise ConvergenceError("a cell is inverted")
+
+    cubes, told = scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False), list[str]()
+    monkeypatch.setattr(ObjectOnCubes, "identified", without_equilibrium)
+    found = Mock(spec=FieldEstimate, limited_by_mesh=True)
+    stated, bounds = parse_known_zones(["pad=10 kPa, 0.45"], list(NAMES.values())), Bounds()
+    same, kept = identified_on_smaller_cubes(
+        cubes, found, stated, most=520, law="neo_hookean", bounds=bounds, progress=lambda report: told.append(report.stage)
+    )
+    assert same is cubes and kept is found and told[-1].endswith("on the larger ones: a cell is inverted")

@@ -392,7 +392,7 @@ class _Recipe:
                 covariance, coarse = corrected.doubt, not corrected.converged
             covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
             of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
-        bias, left = bias_of_prior(at, quadratic)
+        best, (bias, left) = theta, bias_of_prior(at, quadratic)
         total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         if shift is not None:
@@ -405,7 +405,7 @@ class _Recipe:
         borders, parts = (None, None) if refined is None else (refined.borders, refined.parts)
         return FieldEstimate(
             model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,
-            judged, budget, shift, others, borders, parts,
+            judged, budget, shift, others, borders, parts, best - theta,
         )  # fmt: skip
 
     def _doubt_at_bounds(self, theta: FloatArray) -> FloatArray:

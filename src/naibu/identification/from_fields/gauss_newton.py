@@ -163,6 +163,8 @@ def first_point(model: FieldModel, theta: FloatArray) -> Point:
     step = at.loaded_solved([-g[:, None] for g in at.gradient()[1]])
     moved = at.forward(None, step)
     states = [u + du.reshape(u.shape) for u, du in zip(at.point.states, moved, strict=True)]
+    if small is not model:  # what preconditions small strain does so at finite strain, and took longer to make than all else here
+        model.boundary[:], model.informed[:] = small.boundary, small.informed
     return model.evaluate(theta, states if model.law.linear else model.from_rest(theta, states))
 
 

@@ -99,7 +99,7 @@ def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize, s
     lost = refused.any(axis=0)
     apart = np.zeros(len(names), dtype=bool) if set_apart is None else set_apart
     if (lost <= apart).all() and (sure[0] & ~lost).any():
-        return _without(judged, names, np.flatnonzero(lost), half)
+        return _without(judged, names, refused, half)
     reason = f"zones end inside of elements, and with half their size moduli would change {half.times[refused].max():.2g} times"
     advised = f"{reason}: use smaller ones"
     reasons = (advised, *judged.reasons)
@@ -108,12 +108,13 @@ def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize, s
     return replace(judged, explanation=Explanation.NOT_EXPLAINED, reasons=reasons)
 
 
-def _without(judged: Verdict, names: Sequence[str], lost: IntArray, half: HalfSize) -> Verdict:
-    """Return the verdict with zones (numbers `lost`) named as not determined."""
-    each = [f"{names[i]} (with half their size its moduli would change {half.times[:2, i].max():.2g} times)" for i in lost.tolist()]
+def _without(judged: Verdict, names: Sequence[str], refused: BoolArray, half: HalfSize) -> Verdict:
+    """Return the verdict with zones of which numbers (rows of `HalfSize.changes`) are `refused` (3, count) named as not determined."""
+    lost = np.flatnonzero(refused.any(axis=0)).tolist()
+    each = [f"{names[i]} (with half their size its moduli would change {half.times[refused[:, i], i].max():.2g} times)" for i in lost]
     limits = f"elements of this size do not determine {' and '.join(each)}"
     part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
-    return replace(judged, explanation=part, limits=limits, mesh_dependent=tuple(names[i] for i in lost.tolist()))
+    return replace(judged, explanation=part, limits=limits, mesh_dependent=tuple(names[i] for i in lost))
 
 
 def limited_by_elements(judged: Verdict, names: Sequence[str], of_mesh: FloatArray, bounds: FloatArray) -> Verdict:

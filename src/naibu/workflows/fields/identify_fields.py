@@ -26,6 +26,8 @@ from naibu.identification.from_fields.forward.sensitivities import young_and_poi
 from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.regions.relative_map import identify_relative_map
+from naibu.identification.from_fields.uncertainty import Uncertainty, grade
+from naibu.identification.verdict import Explanation
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
@@ -159,7 +161,8 @@ def identify_fields(
         Finite or small strain.
     element_size_mm : float
         Edge length of the cubes; 0 chooses it so that there are about 1200, or 2500 for a map; fewer where a cell
-        of zones would hold less than two points, more where a zone would share less than three quarters with its cubes.
+        of zones would hold less than two points, more where a zone would share less than three quarters with its cubes, or where their
+        size leaves more in doubt of moduli than the measurement does (then up to 2800).
     unit, spacing_mm : str, sequence of float, optional
         Unit of fields that do not state theirs, or the size of a voxel along x, y, z, mm, of fields in voxels (see `naibu.io.read_field`).
     node_spacing : sequence of float, optional
@@ -277,11 +280,22 @@ def table_of_zones(result: FieldIdentification) -> Table:
     rows: list[tuple[Cell, ...]] = []
     if found.uncertainty is not None:
         young, poisson = found.intervals()
+        how = _grades(found, found.uncertainty)
         for i, name in enumerate(found.zones.names):
             e, nu = (float(values[i]) for values in (found.young_modulus, found.poisson_ratio))
-            rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i])))
-    columns = ("zone", f"Young's modulus, {result.unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
+            rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i]), how[i]))
+    moduli = (f"Young's modulus, {result.unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
+    columns = ("zone", *moduli, "Young's modulus is")
     return Table("Moduli", columns, tuple(rows))
+
+
+def _grades(found: FieldEstimate, uncertainty: Uncertainty) -> list[str]:
+    """Return in words how well Young's modulus of every zone is determined, as the sentences say."""
+    judged = found.verdict
+    usable, apart = judged is None or judged.ok, () if judged is None else judged.mesh_dependent
+    sure = (judged is None or judged.explanation is Explanation.EXPLAINED) and TOO_COARSE not in found.identifiability
+    sd = uncertainty.of_young_and_poisson(found.theta)[0]
+    return [grade(s, usable=usable, sure=sure, apart=n in apart) for s, n in zip(sd, found.zones.names, strict=True)]
 
 
 def table_of_assumptions(result: FieldIdentification) -> Table:

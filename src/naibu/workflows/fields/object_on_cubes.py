@@ -9,6 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
@@ -24,7 +25,7 @@ from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.known_zones import KnownZones
 from naibu.workflows.fields.measured_load_case import measured_load_case
 
-MOST_REFINED = 4200  # cells that are made unasked where smaller ones change moduli: a few minutes on two cores
+MOST_REFINED = 2800  # cells that are made unasked where smaller ones change moduli: beyond, the time grows with the square of their number
 WORTHWHILE = 0.85  # of the edge length: refinement by less changes little
 HALF = 0.5  # of it: the least by which cells are made smaller at once
 UNRESOLVED = (
@@ -178,7 +179,12 @@ def identified_on_smaller_cubes(
         return cubes, found
     report_progress(progress, f"the size of cubes limits what is known of moduli: again with cubes of {size:.2g} mm")
     smaller = scanned.on_cubes(size, (), exactly=True, each_cell=False)
-    return smaller, smaller.identified(stated, law=law, bounds=bounds, each_cell=False, progress=progress, coarser=found)
+    try:
+        again = smaller.identified(stated, law=law, bounds=bounds, each_cell=False, progress=progress, coarser=found)
+    except ConvergenceError as error:
+        report_progress(progress, f"smaller cubes lead nowhere, and moduli are those on the larger ones: {error}")
+        return cubes, found
+    return smaller, again
 
 
 def _start(found: FieldEstimate) -> tuple[FloatArray, FloatArray]:
