@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from naibu.identification.lattice_calibration.least_squares import unsettled_covariance
-from naibu.identification.lattice_calibration.local_regression import LocalRegression, regression
+from naibu.identification.lattice_calibration.local_regression import LocalRegression, Pair, regression
+from naibu.identification.lattice_calibration.simulated_points import SimulatedPoints
 
 COUNT, PRIOR_SD = 2000, 3.0
 
@@ -36,20 +37,24 @@ class Jumping:
 
     def estimated(self) -> tuple[np.ndarray, np.ndarray, bool]:
         """Return errors and standard deviations, and whether the regressions settled."""
-        p = len(self.truth)
-        local = LocalRegression(self, np.zeros(p), np.zeros(p), PRIOR_SD, self)  # type: ignore[arg-type]
+        p, points = len(self.truth), SimulatedPoints(self, self)  # type: ignore[arg-type]
+        begin = np.zeros(p)
+        local = LocalRegression(points, begin, points.simulated([(begin, False)])[0], begin, PRIOR_SD, 0.03**2 * np.eye(p))
         point, covariance = local.run()
         return point.theta - self.truth, np.sqrt(np.diag(covariance)), local.settled
 
 
 def test_without_jumps_it_is_least_squares() -> None:
     made = Jumping(0, [0.3, 1.0, 2.0], 0.0)
-    theta = 0.03 * np.random.default_rng(1).standard_normal((20, 3))
-    fit = regression(theta, made.many(None, [(t, True) for t in theta]), np.zeros(3), 0.03**2 * np.eye(3), np.zeros(3), PRIOR_SD)
     base = made._law(np.zeros(3), fine=True) - made.measured
+    pairs = []
+    for row in 0.03 * np.random.default_rng(1).standard_normal((20, 3)):
+        one, other = (made._law(side * row, fine=True) - made.measured for side in (1.0, -1.0))
+        pairs.append(Pair(np.log1p([row, -row]), 0.5 * (one - other), 0.5 * (one + other) - base))
+    fit = regression(pairs, np.zeros(3), base, COUNT // 2, 0.03**2 * np.eye(3), np.zeros(3), PRIOR_SD)
     hessian = made.slopes.T @ made.slopes + np.eye(3) / PRIOR_SD**2
-    np.testing.assert_allclose(fit.step, -np.linalg.solve(hessian, made.slopes.T @ base), rtol=1e-6)
-    np.testing.assert_allclose(np.concatenate(fit.slopes), made.slopes, atol=1e-8)
+    np.testing.assert_allclose(fit.steps[0], -np.linalg.solve(hessian, made.slopes.T @ base), rtol=1e-6)
+    np.testing.assert_allclose(fit.slopes, made.slopes, atol=1e-8)
     np.testing.assert_allclose(fit.covariance, np.linalg.inv(hessian), rtol=1e-5, atol=1e-9)
 
 

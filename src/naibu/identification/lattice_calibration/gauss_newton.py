@@ -33,8 +33,9 @@ from naibu.identification.lattice_calibration.least_squares import (
     unsettled_covariance,
 )
 from naibu.identification.lattice_calibration.local_regression import LocalRegression
-from naibu.identification.lattice_calibration.mapped_search import MappedSearch
+from naibu.identification.lattice_calibration.secant_search import SecantSearch
 from naibu.identification.lattice_calibration.shape_distance import closest_points
+from naibu.identification.lattice_calibration.simulated_points import SimulatedPoints
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns, identifiability
 from naibu.identification.lattice_calibration.widened_covariance import widened_covariance
 from naibu.mechanics.lattices.model.lattice import Lattice
@@ -195,8 +196,9 @@ def calibrate_lattice(
     Iterations take steps of time that are long but after changes of motion; then what residuals of fine steps throughout differ by is added
     to theirs, and the search goes on. Where the law does not reproduce points or forces to within their
     noise, the noise is taken as that much larger, each for itself, and the search goes on: neither then outweighs the other by being
-    measured more precisely than the model can tell. Where derivatives are differences of simulations, as in contact, Broyden's updates
-    spare most of them (`MappedSearch`), and regressions around the end give the estimate and its covariance (`LocalRegression`).
+    measured more precisely than the model can tell. Where derivatives are differences of simulations, as in contact, secants through
+    what was simulated spare most of them (`SecantSearch`), and regressions around the end give the estimate, corrected by fine steps, its
+    covariance, and by how much the noise is larger than stated (`LocalRegression`).
 
     Parameters
     ----------
@@ -237,7 +239,7 @@ def calibrate_lattice(
     at = Evaluations(threads, executor, progress)
     try:
         if problem.shifts(np.exp(centre)) is not None:
-            return _searched_by_mapping(problem, centre, first, prior_sd, max_iterations, reweigh, at)
+            return _searched_in_contact(problem, centre, first, prior_sd, max_iterations, at)
         return _searched(problem, centre, first, prior_sd, max_iterations, reweigh, widen, at)
     except KeyboardInterrupt:
         if at.best is None or at.problem is None:
@@ -274,12 +276,13 @@ def _in_other_units(point: EvaluatedPoint, old: tuple[float, float], new: tuple[
     return EvaluatedPoint(point.theta, (shape * points, force * forces), (shape_slopes * points, force_slopes * forces))
 
 
-def _searched_by_mapping(
-    problem: InverseProblem, centre: FloatArray, first: FloatArray, prior_sd: float, most: int, reweigh: bool, at: Evaluations
+def _searched_in_contact(
+    problem: InverseProblem, centre: FloatArray, first: FloatArray, prior_sd: float, most: int, at: Evaluations
 ) -> LatticeEstimate:
-    search = MappedSearch(problem, centre, prior_sd, at, first)
-    search.run(most, reweigh=reweigh)
-    local = LocalRegression(problem, search.theta, centre, prior_sd, at)
+    points = SimulatedPoints(problem, at)
+    search = SecantSearch(points, centre, prior_sd, first)
+    search.run(most)
+    local = LocalRegression(points, search.theta, search.residual, centre, prior_sd, search.covariance())
     point, covariance = local.run()
     information = np.linalg.inv(covariance) - np.eye(len(centre)) / prior_sd**2
     if not local.settled:  # derivatives there say nothing of where the least misfit is

@@ -73,15 +73,6 @@ def cost_of(point: EvaluatedPoint, centre: FloatArray, prior_sd: float) -> float
     return cost_at(point.residual, point.theta, centre, prior_sd)
 
 
-def next_step(point: EvaluatedPoint, centre: FloatArray, prior_sd: float, damping: float) -> tuple[FloatArray, float]:
-    """Return the next change of theta, and the decrease of the cost that an undamped one promises."""
-    hessian = point.information + np.eye(len(point.theta)) / prior_sd**2
-    slope = point.gradient() + (point.theta - centre) / prior_sd**2
-    step = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), slope)
-    limited = step * min(1.0, LONGEST / max(float(np.abs(step).max()), 1e-300))
-    return np.asarray(limited, dtype=np.float64), float(-slope @ step)
-
-
 def step_within(point: EvaluatedPoint, centre: FloatArray, prior_sd: float, reach: float) -> tuple[FloatArray, float]:
     """Return the change of theta that lowers the linearised cost most, none of its components longer than `reach`; and the decrease.
 

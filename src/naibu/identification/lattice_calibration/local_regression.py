@@ -1,37 +1,46 @@
 """Estimate and covariance where residuals jump: derivatives by regression over the interval itself, what they leave as error of the model.
 
-In contact residuals jump, as points begin to slip, and bend sharply where they stick and slip by turns. A difference along one parameter
-takes jumps for derivatives, and a search goes to the bottom of the nearest jump. Here the lattice is simulated at points all around the
-estimate, as far away as its covariance reaches; a linear regression through all of them gives derivatives over that range
-(:cite:t:`ralston1978`), in which jumps cancel. What it does not explain of the simulations is an error of the model that measurements
-have as well, since the truth lies at one such point: it counts as noise, by which residuals are weighed, and whose effect on the estimate
-is added to the covariance, with its correlations (:cite:t:`kennedy2001`). Differences between long and short steps of time are treated
-alike, from a few points.
+In contact residuals jump, as points begin to slip, and bend sharply where they stick and slip by turns. A difference along one
+parameter takes jumps for derivatives, and a search goes to the bottom of the nearest jump. Here the lattice is simulated in pairs on
+both sides of the estimate, as far away as its covariance reaches; a linear regression through half their differences, which are free
+of curvature, gives derivatives over that range (:cite:t:`ralston1978`), in which jumps cancel. What it does not explain of the
+simulations is an error of the model that measurements have as well, since the truth lies at one such point: it counts as noise, by
+which residuals are weighed, and whose effect on the estimate is added to the covariance, with its correlations
+(:cite:t:`kennedy2001`). So do the curvature and differences between long and short steps of time, from a few points. Information that
+jumps alone may pretend is taken away: how much that is, is told by exchanging what the regression leaves among its rows (a permutation
+test; :cite:t:`good2005`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
 from scipy.ndimage import uniform_filter1d
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
-from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
-from naibu.identification.lattice_calibration.least_squares import Evaluations
+from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint
+from naibu.identification.lattice_calibration.least_squares import unsettled_covariance
+from naibu.identification.lattice_calibration.simulated_points import FARTHEST, SimulatedPoints
 
-FIRST = 0.03  # standard deviation of logarithms around the end of a search
-SPREAD = (0.004, 0.12)  # of later ones, which follow the covariance
-ROUNDS = 6
-WIDER = 1.5  # standard deviations over those of the points, from which the regression does not reach as far as its interval
-LONGEST = 0.4  # change of a logarithm in a round
+NARROWEST = 0.004  # standard deviation of relative changes of the values around the estimate, along principal axes
+SPREAD = 2.0  # of these deviations over those of the estimate: what jumps pretend falls with the square
+EXCHANGES = 100
+WIDEST = (0.01, 0.06, 0.24)  # largest one: at least, at first, and at most
+PAYS = (
+    4.0  # by how much less a regression must leave of the simulations where these are half as far away: what they left then was curvature
+)
+ROUNDS = 8
+REACHES = 2.0  # of these deviations, how far a step follows a regression
+WORTH = 3.0  # decrease of chi-squared for each parameter that is worth another round
+TOO_FAR = 8.0  # squared, mean over the parameters: points that do not count
+WIDER = 2.0  # standard deviations over those of the points, from which the regression does not reach as far as its interval
+LONGEST = 0.4  # relative change of a value in a round
 CLOSE = 2.0  # standard deviations: a step within them ends the rounds
 FINE = 3  # points with fine steps
 MISFIT = 1.2  # mean square of residuals in units of noise and error of the model, from which both are taken as larger
-LEAST = 0.02  # of the information of a combination, which is left at least where errors of the model explain the rest
 NEIGHBOURS = (101, 15)  # of points and of forces, whose errors of the model are averaged
 
 
@@ -41,184 +50,285 @@ class Regression:
 
     Attributes
     ----------
-    step : ndarray, shape (p,)
-        From its centre to the estimate.
+    steps : tuple of ndarray, shape (p,)
+        From its centre to the estimate, without and with what jumps may pretend.
     covariance : ndarray, shape (p, p)
         Of the estimate, errors of the model included.
-    slopes : tuple of ndarray
+    slopes : ndarray, shape (n, p)
         Derivatives.
+    weights : ndarray, shape (n,)
+        Of residuals: one over their variance, noise and errors of the model, in units of the stated noise.
+    jumps : float
+        What the regression leaves of the simulations: a sum of squares, in units of noise and error of the model.
+    free : int
+        By how many points more than unknowns there are.
     """
 
-    step: FloatArray
+    steps: tuple[FloatArray, FloatArray]
     covariance: FloatArray
-    slopes: Residual
+    slopes: FloatArray
+    weights: FloatArray
+    jumps: float
+    free: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pair:
+    """Simulations on both sides of a point: half their difference is free of curvature.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (2, p)
+        Logarithms that were simulated.
+    rise, even : ndarray, shape (n,)
+        Half the difference of the residuals, and what their mean differs by from residuals in the middle.
+    """
+
+    theta: FloatArray
+    rise: FloatArray
+    even: FloatArray
+
+    def change(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return half the difference (p,) and the mean (p,) of both relative changes of the values at theta (p,)."""
+        first, second = np.expm1(np.clip(self.theta - theta, -FARTHEST, FARTHEST))
+        return 0.5 * (first - second), 0.5 * (first + second)
 
 
 def regression(
+    pairs: Sequence[Pair],
     theta: FloatArray,
-    simulated: Sequence[Residual],
-    middle: FloatArray,
+    level: FloatArray,
+    points: int,
     spread: FloatArray,
     centre: FloatArray,
     prior_sd: float,
-    errors: Sequence[Residual] = (),
+    errors: Sequence[FloatArray] = (),
 ) -> Regression:
     """Return the estimate of a regression of residuals, its covariance and the derivatives.
 
     Parameters
     ----------
-    theta : ndarray, shape (n, p)
-        Logarithms that were simulated; the nearest ``3 p + 2`` count, less the farther away they are.
-    simulated : sequence of tuple of ndarray
-        Residuals of points and forces there, in units of their noise.
-    middle, spread : ndarray, shape (p,), (p, p)
-        Around which point, and how far, the regression holds.
+    pairs : sequence of Pair
+        What was simulated; the nearest ``2 p + 2`` count, less the farther away they are.
+    theta, level : ndarray, shape (p,), (n,)
+        Logarithms in the middle, and residuals there in units of their noise.
+    points : int
+        How many of them are of points.
+    spread : ndarray, shape (p, p)
+        Covariance of relative changes of the values over which the regression holds.
     centre, prior_sd
         Of the weak prior.
-    errors : sequence of tuple of ndarray
+    errors : sequence of ndarray, shape (n,)
         Further errors of the model.
     """
-    p, prior = len(middle), np.eye(len(middle)) / prior_sd**2
-    away = (np.linalg.solve(np.linalg.cholesky(spread), (theta - middle).T) ** 2).sum(axis=0) / p
-    near = np.argsort(away)[: 3 * p + 2]
-    weight = 1.0 / (1.0 + (0.5 * away[near]) ** 2)
-    units = np.concatenate([[1.0], np.sqrt(np.diag(spread))])
-    design = np.column_stack([np.ones(len(near)), theta[near] - middle])
-    count, rows = len(simulated[0][0]), np.stack([np.concatenate(simulated[k]) for k in near])
-    root = np.sqrt(weight)[:, None]
-    found = np.linalg.lstsq(root * design * units, root * rows, rcond=1e-8)[0] * units[:, None]
-    free = max(len(near) - p - 1, 1) / len(near)
-    left = (rows - design @ found) * root / np.sqrt(weight.mean() * free)
-    level, slopes, mean_square = found[0], found[1:].T, (left**2).mean(axis=0)
-    further = np.stack([np.concatenate(e) for e in errors]) if errors else np.zeros((0, len(level)))
-    if len(further):
-        mean_square = mean_square + (further**2).sum(axis=0) / max(len(further) - 1, 1)
+    p, prior, root_spread = len(theta), np.eye(len(theta)) / prior_sd**2, np.linalg.cholesky(spread)
+    changes, away = _places(pairs, theta, root_spread)
+    near = np.argsort(away, kind="stable")[: 2 * p + 2]
+    near = near[: max(int((away[near] < TOO_FAR).sum()), p)]
+    weight, rows = 1.0 / (1.0 + (0.5 * away[near]) ** 2), np.stack([pairs[k].rise for k in near])
+    design, units, root = changes[near], np.sqrt(np.diag(spread)), np.sqrt(weight)[:, None]
+    slopes = (np.linalg.lstsq(root * design * units, root * rows, rcond=1e-8)[0] * units[:, None]).T
+    free = len(near) - p
+    left = (rows - design @ slopes.T) * root / np.sqrt(weight.mean() * max(free, 1) / len(near))
+    further = np.stack(errors) if errors else np.zeros((0, len(level)))
+    parts = [
+        (left, 2.0 * max(free, 1) / max(free - 2, 1) / len(near)),  # of half differences; variance of Student's distribution: they are few
+        (np.stack([pairs[k].even for k in near]), 1.0 / len(near)),
+        (further, 1.0 / max(len(further) - 1, 1)),
+    ]
+    weights = _weights(level, sum(share * (rest**2).sum(axis=0) for rest, share in parts), points)
+    uncertain = np.linalg.inv((design * weight[:, None]).T @ design) * weight.mean()  # (p, p), per variance of half a difference
+    jumps = float(weights @ (left**2).mean(axis=0))
+    told, apparent = np.eye(p), (slopes.T * weights) @ slopes
+    if free > 0:
+        spurious = _spurious(root * design, (left * weights) @ left.T * weight.mean(), jumps * uncertain)
+        told = _told(apparent, spurious)
+    information = told @ apparent
+    hessian = 0.5 * (information + information.T) + prior
+    covariance = np.linalg.inv(hessian)
+    slope = told @ slopes.T @ (weights * level) + prior @ (theta - centre)
+    gain = covariance @ told @ (slopes.T * weights)
+    steps = _limited(hessian, slope), _limited(apparent + prior, slopes.T @ (weights * level) + prior @ (theta - centre))
+    for rest, share in parts:
+        moved = rest @ gain.T
+        covariance = covariance + share * moved.T @ moved
+    return Regression(steps, _at_most(covariance, unsettled_covariance(theta, centre, prior_sd)), slopes, weights, jumps, free)
+
+
+def _at_most(covariance: FloatArray, most: FloatArray) -> FloatArray:
+    """Return a covariance (p, p) with variances of at most those of another one."""
+    factor = np.minimum(np.sqrt(np.diag(most) / np.diag(covariance)), 1.0)
+    limited = covariance * np.outer(factor, factor)
+    return np.asarray(0.5 * (limited + limited.T))
+
+
+def _places(pairs: Sequence[Pair], theta: FloatArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return half the differences (m, p) of pairs, and how far they are away, (m,), in units of the variance with that `root`."""
+    changes, middles = (np.array(part) for part in zip(*(pair.change(theta) for pair in pairs), strict=True))
+    size, away = ((np.linalg.solve(root, part.T) ** 2).mean(axis=0) for part in (changes, middles))
+    return changes, away + np.maximum(size - 1.0, 0.0)
+
+
+def _limited(hessian: FloatArray, slope: FloatArray) -> FloatArray:
+    """Return the step of Gauss and Newton, damped where it is longer than `LONGEST`."""
+    step, damping = -np.linalg.solve(hessian, slope), 1e-4 * np.trace(hessian) / len(slope)
+    while np.abs(step).max() > LONGEST:
+        step = -np.linalg.solve(hessian + damping * np.eye(len(slope)), slope)
+        damping *= 3.0
+    return np.asarray(step, dtype=np.float64)
+
+
+def _weights(level: FloatArray, mean_square: FloatArray, points: int) -> FloatArray:
+    """Return one over the variance of residuals (n,): noise, as large as the misfit where that is more, and errors of the model."""
     noise = np.ones(len(level))
-    for part, size in zip((slice(count), slice(count, None)), NEIGHBOURS, strict=True):
+    for part, size in zip((slice(points), slice(points, None)), NEIGHBOURS, strict=True):
         if len(level[part]):
             mean_square[part] = uniform_filter1d(mean_square[part], size)
             excess = float((level[part] ** 2 / (1.0 + mean_square[part])).mean())
             noise[part] = excess if excess > MISFIT else 1.0
-    weights = 1.0 / (noise + mean_square)
-    uncertain = np.linalg.inv((design * weight[:, None]).T @ design) * weight.mean()  # (1 + p, 1 + p), per variance of a residual
-    jumps = float(weights @ (left**2).mean(axis=0))
-    apparent = (slopes.T * weights) @ slopes
-    hessian = _without(apparent, jumps * uncertain[1:, 1:]) + prior
-    slope = slopes.T @ (weights * level) + prior @ (middle - centre)
-    step = -np.linalg.solve(apparent + prior, slope)  # the shorter: what jumps make of it is too far
-    gain = np.linalg.solve(apparent + prior, slopes.T * weights)
-    covariance = np.linalg.inv(hessian)
-    wider = np.sqrt(np.diag(covariance) / np.diag(np.linalg.inv(apparent + prior)))
-    place = np.concatenate([[1.0], step])
-    student = (len(near) - p - 1) / max(len(near) - p - 3, 1)  # variance of Student's distribution: errors are known from few simulations
-    known = student * (1.0 + float(place @ uncertain @ place))
-    for rest, share in ((left, known / len(left)), (further, (1.0 + 1.0 / max(len(further), 1)) / max(len(further) - 1, 1))):
-        moved = (rest @ gain.T) * wider
-        covariance = covariance + share * moved.T @ moved
-    most = np.minimum(prior_sd / np.sqrt(np.diag(covariance)), 1.0)
-    covariance = covariance * np.outer(most, most)
-    damping = 1e-4 * np.trace(apparent) / p
-    while np.abs(step).max() > LONGEST:
-        step = -np.linalg.solve(apparent + prior + damping * np.eye(p), slope)
-        damping *= 3.0
-    return Regression(step, 0.5 * (covariance + covariance.T), (slopes[:count], slopes[count:]))
+    return np.asarray(1.0 / (noise + mean_square))
 
 
-def _without(information: FloatArray, spurious: FloatArray) -> FloatArray:
-    """Return an information (p, p) without what is spurious in it, but at least `LEAST` of it in any direction."""
+def _spurious(design: FloatArray, products: FloatArray, mean: FloatArray) -> FloatArray:
+    """Return the information (p, p) that what a regression leaves may pretend: its `mean`, larger by what chance makes of it.
+
+    The rows that the regression leaves, with `products` (m, m), are exchanged among the rows of its design (m, p) again and again: where
+    few kinds of jumps make them, some combination of parameters appears to be known much better than in the mean (:cite:t:`good2005`).
+    """
+    rng, root, reach = np.random.default_rng(0), np.linalg.cholesky(mean + 1e-300 * np.eye(len(mean))), np.linalg.pinv(design)
+    largest = []
+    for _ in range(EXCHANGES):
+        order = rng.permutation(len(products))
+        pretended = np.linalg.solve(root, reach @ products[np.ix_(order, order)] @ reach.T)
+        largest.append(np.linalg.eigvalsh(np.linalg.solve(root, pretended.T)).max())
+    return np.asarray(mean * max(float(np.quantile(largest, 0.95)), 1.0))
+
+
+def _told(information: FloatArray, spurious: FloatArray) -> FloatArray:
+    """Return what an apparent information (p, p), or a gradient, is multiplied by so that it is without what is spurious in it.
+
+    Along combinations in which the spurious part explains all of it, nothing is left: there the weak prior holds.
+    """
     p = len(information)
-    values, vectors = scipy.linalg.eigh(information - spurious, information + 1e-9 * np.trace(information) / p * np.eye(p))
-    back = np.linalg.inv(vectors)
-    return np.asarray(back.T @ (np.maximum(values, LEAST)[:, None] * back))
+    values, vectors = scipy.linalg.eigh(information, spurious + 1e-12 * np.trace(information) / p * np.eye(p))
+    share = np.maximum(1.0 - 1.0 / np.maximum(values, 1e-300), 0.0)
+    return np.asarray(np.linalg.solve(vectors.T, share[:, None] * vectors.T))
 
 
 @dataclass(slots=True)
 class LocalRegression:
     """Rounds of regression from the end of a search on.
 
+    In every round the lattice is simulated on both sides along random orthogonal directions, as far away as is typical of the
+    covariance, but     no farther than the linear model holds. Both steps of the regression are simulated, the better one is taken.
+    Once steps stay within the     covariance and chi-squared falls no longer, fine steps of time at a few points tell what to add to
+    residuals of long ones.
+
     Attributes
     ----------
-    problem : InverseProblem
-        With the noise as it is stated.
-    theta : ndarray, shape (p,)
-        Where it is.
+    points : SimulatedPoints
+        What was simulated, among it where it is.
+    theta, long : ndarray, shape (p,), (n,)
+        Where it is, and residuals of long steps there.
     centre, prior_sd
         Of the weak prior.
-    at : Evaluations
-        Of residuals.
-    runs, rounds : int
-        Simulations, and regressions.
+    covariance : ndarray, shape (p, p)
+        As far as it is known.
+    rounds : int
+        Regressions.
     settled : bool
         Whether a last regression moved every value by less than its interval.
     """
 
-    problem: InverseProblem
+    points: SimulatedPoints
     theta: FloatArray
+    long: FloatArray
     centre: FloatArray
     prior_sd: float
-    at: Evaluations
-    runs: int = 0
+    covariance: FloatArray
     rounds: int = 0
     settled: bool = False
-    _points: list[FloatArray] = field(default_factory=list)
-    _found: list[Residual] = field(default_factory=list)
+    _offset: FloatArray = field(init=False)  # (n,), of fine steps from long ones
+    _pairs: list[Pair] = field(default_factory=list)
+    _errors: list[FloatArray] = field(default_factory=list)  # how that varies
+    _widest: float = WIDEST[1]
+    _shrinks: bool = True
+    _left: float = np.inf  # what the last regression left
+    _rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     def run(self) -> tuple[EvaluatedPoint, FloatArray]:
-        """Return where it ended, with residuals of fine steps, and the covariance (p, p)."""
-        p, rng = len(self.theta), np.random.default_rng(0)
-        spread, corrected = FIRST**2 * np.eye(p), False
-        (fine, long) = self._simulated([(self.theta, True), (self.theta, False)])
-        offset, errors = _difference(fine, long), list[Residual]()
+        """Return where it ended, with residuals as of fine steps, and the covariance (p, p)."""
+        p, corrected, due = len(self.theta), False, False
         while True:
-            self._sample(spread, rng, both=self.rounds == 0)
-            fit = regression(
-                np.array(self._points), [_sum(r, offset) for r in self._found], self.theta, spread, self.centre, self.prior_sd, errors
-            )
-            self.rounds += 1
+            spread = _within(SPREAD**2 * self.covariance, self._widest)
+            self._simulate(spread, p if self.rounds == 0 else (p + 1) // 2, first=self.rounds == 0, several=due)
+            corrected, self.rounds = corrected or due, self.rounds + 1
+            fit = self._fit(spread)
             sd = np.sqrt(np.diag(fit.covariance))
-            near = bool((np.abs(fit.step) <= CLOSE * sd).all())
-            self.theta = self._held(self.theta + fit.step)
-            shown = np.clip(sd, *SPREAD)
-            near = near and bool((shown < WIDER * np.sqrt(np.diag(spread))).all())
-            spread = fit.covariance * np.outer(shown / sd, shown / sd)
+            near = bool((np.abs(fit.steps) <= CLOSE * sd).all()) and fit.free >= p // 2
+            near = near and np.trace(np.linalg.solve(spread, _within(SPREAD**2 * fit.covariance, self._widest))) < WIDER**2 * p
+            near = self._move(fit, spread) < WORTH * p and near
+            self.covariance = fit.covariance
             if self.rounds >= ROUNDS or (near and corrected):
                 self.settled = near and corrected
-                return EvaluatedPoint(self.theta, fine, fit.slopes), fit.covariance
-            if near:
-                fine, offset, errors = self._corrected(spread, rng)
-                corrected = True
+                residual = self.points.parts(self.long + self._offset)
+                return EvaluatedPoint(self.theta, residual, self.points.parts(fit.slopes)), fit.covariance
+            due = near
+            self._adapt(fit.jumps)
 
-    def _sample(self, spread: FloatArray, rng: np.random.Generator, *, both: bool) -> None:
-        """Simulate along random orthogonal directions, as far away as is typical of the covariance `spread`, and in the middle."""
-        p = len(self.theta)
-        away = np.sqrt(p) * np.linalg.cholesky(spread) @ np.linalg.qr(rng.standard_normal((p, p)))[0]
-        sides = (1.0, -1.0) if both else (1.0,)
-        points = [self.theta, *(self._held(self.theta + side * row) for side in sides for row in away.T)]
-        self._found += self._simulated([(point, False) for point in points])
-        self._points += points
+    def _adapt(self, jumps: float) -> None:
+        """Simulate nearer as long as the regression leaves much less there, curvature; else farther away, where jumps count less."""
+        least, _, most = WIDEST
+        if self._shrinks and jumps * PAYS > self._left:
+            self._shrinks, self._widest = False, min(2.0 * self._widest, most)
+        elif self._shrinks and jumps > 1.0:
+            self._left, self._widest = jumps, max(0.5 * self._widest, least)
 
-    def _corrected(self, spread: FloatArray, rng: np.random.Generator) -> tuple[Residual, Residual, list[Residual]]:
-        """Return residuals of fine steps here, what they differ from long ones in the mean of a few points, and how that varies."""
-        root = np.linalg.cholesky(spread)
-        points = [self.theta, *(self._held(self.theta + root @ rng.standard_normal(len(self.theta))) for _ in range(FINE - 1))]
-        found = self._simulated([(point, step) for point in points for step in (True, False)])
-        offsets = [_difference(fine, long) for fine, long in zip(found[::2], found[1::2], strict=True)]
-        mean = (np.mean([o[0] for o in offsets], axis=0), np.mean([o[1] for o in offsets], axis=0))
-        self._points += points
-        self._found += found[1::2]
-        return found[0], mean, [_difference(o, mean) for o in offsets]
+    def _simulate(self, spread: FloatArray, count: int, *, first: bool, several: bool) -> None:
+        """Simulate on both sides in random orthogonal directions, with fine steps here at `first`, at `several` points where due."""
+        root, p = np.linalg.cholesky(spread), len(self.theta)
+        directions = np.sqrt(p) * (root @ np.linalg.qr(self._rng.standard_normal((p, p)))[0]).T[:count]
+        around = [self.points.moved(self.theta, side * row) for row in directions for side in (1.0, -1.0)]
+        others = [self.points.moved(self.theta, root @ self._rng.standard_normal(p) / SPREAD) for _ in range(FINE - 1)] if several else []
+        fine = [self.theta, *others] if first or several else []
+        found = self.points.simulated([*((theta, True) for theta in fine), *((theta, False) for theta in (*others, *around))])
+        if fine:
+            long = [self.long, *found[len(fine) : len(fine) + len(others)]]
+            offsets = np.array([own - other for own, other in zip(found, long, strict=False)])
+            self._offset = offsets.mean(axis=0)
+            self._errors = list(offsets - self._offset) if several else []
+        inverse = np.linalg.inv(self.covariance)
+        for k in range(len(fine) + len(others), len(found), 2):
+            theta, (one, other) = np.array(around[k - len(fine) - len(others) :][:2]), found[k : k + 2]
+            pair = Pair(theta, 0.5 * (one - other), 0.5 * (one + other) - self.long)
+            change = pair.change(self.theta)[0]
+            farther = max(float(change @ inverse @ change) / p, 1.0)  # curvature grows with the square
+            self._pairs.append(replace(pair, even=pair.even / farther))
 
-    def _simulated(self, trials: Sequence[tuple[FloatArray, bool]]) -> list[Residual]:
-        self.runs += len(trials)
-        return self.at.many(self.problem, trials)
+    def _fit(self, spread: FloatArray) -> Regression:
+        level = self.long + self._offset
+        return regression(self._pairs, self.theta, level, self.points.points, spread, self.centre, self.prior_sd, self._errors)
 
-    def _held(self, theta: FloatArray) -> FloatArray:
-        return np.asarray(np.log(self.problem.unknowns.held(np.exp(theta))), dtype=np.float64)
+    def _move(self, fit: Regression, spread: FloatArray) -> float:
+        """Move by the better step of a regression, as far as the regression reaches, if residuals as it weighs them get less.
+
+        Returns the decrease of chi-squared, errors of the model not regarded: while it goes on falling, they are not what is left.
+        """
+        trials = []
+        for step in fit.steps:
+            away = np.sqrt(float(step @ np.linalg.solve(spread, step)) / len(step))
+            trials.append(self.points.moved(self.theta, step * min(1.0, REACHES / max(away, 1e-300))))
+        found = self.points.simulated([(theta, False) for theta in trials])
+        places = [(self.theta, self.long), *zip(trials, found, strict=True)]
+        before = float(((self.long + self._offset) ** 2).sum())
+        self.theta, self.long = min(places, key=lambda place: self._cost(fit, *place))
+        return before - float(((self.long + self._offset) ** 2).sum())
+
+    def _cost(self, fit: Regression, theta: FloatArray, long: FloatArray) -> float:
+        return float(fit.weights @ (long + self._offset) ** 2 + (((theta - self.centre) / self.prior_sd) ** 2).sum())
 
 
-def _sum(one: Residual, other: Residual) -> Residual:
-    return one[0] + other[0], one[1] + other[1]
-
-
-def _difference(one: Residual, other: Residual) -> Residual:
-    return one[0] - other[0], one[1] - other[1]
+def _within(covariance: FloatArray, most: float) -> FloatArray:
+    """Return a covariance (p, p) with standard deviations of at most `most` along its principal axes."""
+    variance, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.clip(variance, NARROWEST**2, most**2)) @ axes.T)
