@@ -110,6 +110,25 @@ def test_the_front_of_a_cut_stays_closed_until_the_cut_goes_on(seed: int, x: flo
     assert sizes[1] > 0.1 * SIZE**3  # parted; beside the two there may be splinters of cells that were bisected in between
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_a_blade_in_steps_between_which_the_mesh_is_refined_leaves_no_splinter(seed: int) -> None:
+    """Two pieces, one on each side of a plane in any direction, however many cells are bisected at random between the steps."""
+    rng, found = np.random.default_rng(seed), forest()
+    edge, way, normal = np.linalg.qr(rng.normal(size=(3, 3)))[0].T
+    centre, distance = np.array([0.0, 0.0, 10.0]) + rng.uniform(-3.0, 3.0, 3), float(rng.choice([3.0, 5.0]))
+    poses = centre + np.linspace(-24.0, 24.0, 9)[:, None, None] * way + np.array([[-40.0], [40.0]]) * edge
+    for k in range(8):
+        found.refine(rng.choice(found.leaves(), 20))
+        cut = cut_forest(found, swept_blade(poses[k : k + 2]), distance, earlier=swept_blade(poses[: k + 1]) if k else None)
+        assert cut.deviation_mm <= 0.5 * distance
+    check(found, 2)
+    leaves = np.sort(found.leaves())
+    height = (found.points[found.simplices[leaves].astype(np.int64)].mean(axis=1) - centre) @ normal
+    piece = forest_pieces(found)
+    assert len(set(piece[height > distance]) | set(piece[height < -distance])) == 2
+    assert not set(piece[height > distance]) & set(piece[height < -distance])
+
+
 def _surface(found: BisectionForest) -> float:
     faces, _ = found.boundary_faces()
     return _areas(found, faces)

@@ -34,7 +34,7 @@ ROUNDS = 60  # of bisection at most
 MOST_CELLS = 20_000_000
 LEAST_ANGLE = 0.1  # of the smallest dihedral angle of the cells that are bisected; bisection keeps about a fifth of it
 SPLINTER = 16  # cells of a piece that is not cut off where all of it lies as near to the blade as its cut faces may
-OF_STEP = 4  # the same where a blade goes on: between steps with refinement, larger ones could hold both sides together
+OF_STEP = 64  # the same where a blade goes on: between its steps, refinement may have divided them
 
 
 @dataclass(frozen=True, slots=True, eq=False)
