@@ -13,9 +13,8 @@ from naibu.core.arrays import FloatArray
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised
 from naibu.identification.from_fields.mesh_error import refitted
 
-LEFT = (
-    0.5  # part of the bias that is reckoned with as a standard deviation after it was taken off: to first order, and from a biased motion
-)
+# part of the bias that is reckoned with as a standard deviation after it was taken off: to first order, and from a biased motion
+LEFT = 0.5
 
 
 def bias_of_prior(at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, FloatArray]:
