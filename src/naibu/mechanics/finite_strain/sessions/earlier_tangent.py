@@ -154,9 +154,7 @@ class SolverPool:
         self._spare.append(solver)
 
 
-def contact_change(
-    pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTangent, nodes: IntArray, place: IntArray
-) -> BlockChange:
+def contact_change(pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTangent, nodes: IntArray, place: IntArray) -> BlockChange:
     """Return where, and by how much, the stiffness of contacts differs from that of a tangent, mN/mm.
 
     Parameters

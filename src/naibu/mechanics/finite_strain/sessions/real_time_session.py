@@ -45,6 +45,7 @@ BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is 
 NEWTON_S = 10.0  # of a processor for Newton's method in a step that a loop waits for
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
 FURTHER, NEARER = 5, 0.7  # more of them, where the others reduced the error to so much of what it was before
+STALLED = 0.02  # of the contact forces: what iterations that reduce the error no longer may leave where sides of cuts rub
 FEW = 200  # nodes of contact at most with which they cost less than a tangent of the step's own
 UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is tried
 SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
@@ -293,6 +294,7 @@ class RealTimeSession(TangentSession):
     ) -> Generator[None, None, Trial]:
         """Return the best that at most so many iterations find from a beginning, in the time of a processor that there is."""
         mixing, best, begun, bulk = AndersonMixing(DEPTH), trial, trial.error, self._engine._elements.bulk
+        rubs, before = self.engine.assembler.unsymmetric, np.inf
         for near in self._near:  # gaps are those of this guess, which need not be the last one that was looked at
             near.add_force(trial.displacement, np.zeros_like(trial.contact))
         for k in range(most):
@@ -301,7 +303,8 @@ class RealTimeSession(TangentSession):
                 break
             if trial.finished(bulk, begun=k > 0):
                 return trial
-            if k and trial.passable(bulk) and ((k >= USUAL and trial.felt <= FELT) or time.thread_time() > deadline):
+            stalls = rubs and k > 1 and trial.error > NEARER * before and trial.felt <= STALLED
+            if k and trial.passable(bulk) and (stalls or (k >= USUAL and trial.felt <= FELT) or time.thread_time() > deadline):
                 return trial
             yield
             after = yield from self._improved(tangent, trial, inertial, mixing)
@@ -309,7 +312,7 @@ class RealTimeSession(TangentSession):
                 break
             if after.error > JUMP * trial.error:
                 mixing = AndersonMixing(DEPTH)
-            trial = after
+            before, trial = trial.error, after
             best = trial.better(best if k else None)
         return best
 
