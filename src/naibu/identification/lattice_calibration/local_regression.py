@@ -121,7 +121,7 @@ def regression(
     errors : sequence of ndarray, shape (n,)
         Further errors of the model.
     """
-    p, prior, root_spread = len(theta), np.eye(len(theta)) / prior_sd**2, np.linalg.cholesky(spread)
+    p, prior, root_spread = len(theta), np.eye(len(theta)) / prior_sd**2, np.asarray(np.linalg.cholesky(spread), np.float64)
     changes, away = _places(pairs, theta, root_spread)
     near = np.argsort(away, kind="stable")[: 2 * p + 2]
     near = near[: max(int((away[near] < TOO_FAR).sum()), p)]
