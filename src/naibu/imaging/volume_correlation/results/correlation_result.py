@@ -322,7 +322,8 @@ def collected(
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
         full[~valid] = np.nan
-    bias = *biases(fit, c, bending, dilatation), loose
+    # which is the size of an error in an unknown direction, a third of whose square lies along every axis
+    bias = *biases(fit, c, bending, dilatation), loose / np.float32(np.sqrt(3.0))
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
     misplaced = misplacement_variance(fit, misfit)
     biased = bias_variance(fit, bias)
