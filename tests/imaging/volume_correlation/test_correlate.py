@@ -18,7 +18,7 @@ from naibu.imaging.displacement.strain import green_lagrange_strain_of
 from naibu.imaging.measure_displacement import measure_displacement
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import positions
-from naibu.imaging.volume_correlation import correlate, gauss_newton
+from naibu.imaging.volume_correlation import common_content, correlate, gauss_newton
 from naibu.imaging.volume_correlation.common_content import CommonContent
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
@@ -204,7 +204,7 @@ def test_cells_that_have_not_converged_widen_the_covariance_and_are_counted(monk
     monkeypatch.setattr(correlate, "UNSETTLED", 1.0)  # the same steps, whatever counts as still
     same = correlate_volumes(before, after)
     monkeypatch.setattr(gauss_newton, "STILL", 0.0)
-    monkeypatch.setattr(correlate, "MOST_MOVING", 1.0)
+    monkeypatch.setattr(common_content, "MOST_MOVING", 1.0)
     moving = correlate_volumes(before, after)
     assert not moving.converged.all()
     widened = np.trace(moving.cell_covariance - same.cell_covariance, axis1=3, axis2=4)[~moving.converged]
@@ -212,7 +212,7 @@ def test_cells_that_have_not_converged_widen_the_covariance_and_are_counted(monk
     sensed = measure_displacement(before, after)
     assert sensed.facts["unconverged_cells"] == (~moving.converged).sum()
     assert any("have not converged" in text for text in sensed.warnings)
-    monkeypatch.setattr(correlate, "MOST_MOVING", 0.0)
+    monkeypatch.setattr(common_content, "MOST_MOVING", 0.0)
     with pytest.raises(InputError, match="had not converged"):
         correlate_volumes(before, after)
 

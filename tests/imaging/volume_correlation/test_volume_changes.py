@@ -56,12 +56,14 @@ def test_a_part_that_swells_or_shrinks_is_seen_to(ratio: float) -> None:
 
 
 def test_where_volume_is_kept_all_cells_have_one_weight() -> None:
+    """The body moves rigidly; random fields that were solved to a relative 0.06 held 27 % of it where there was much noise."""
     for noise in (5.0, MUCH_NOISE):
         body, found = measured(noise=noise)
         known = found.dilatation[np.isfinite(found.dilatation)]
         assert np.ptp(known) == 0.0
         volume = np.linalg.det(np.eye(3) + found.gradient()[found.valid & body.mask])
         assert np.sqrt(np.mean((volume - 1.0) ** 2)) < 0.01
+        assert held(body, found, body.mask) > 0.8
 
 
 @pytest.mark.parametrize("ratio", [1.2, 0.8])

@@ -21,8 +21,9 @@ from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion
 
-# relative accuracy of the linear solves: a Gauss-Newton step is repeated, a random field need not be more exact than it is random
-STEP_TOLERANCE, SAMPLE_TOLERANCE = 0.1, 0.06
+# relative accuracy of the linear solves: a Gauss-Newton step is repeated, a random field is not, and conjugate gradients find its smooth
+# part last, which is most of it under stiff penalties
+STEP_TOLERANCE, SAMPLE_TOLERANCE = 0.1, 0.01
 SAMPLES_AT_ONCE = 16  # right sides of one solve, which bound the memory
 # empirical, fractions of the unknowns: at least so many count as determined by the data of a kind, and a cell's own weight starts from the
 # common one with the worth of so many
