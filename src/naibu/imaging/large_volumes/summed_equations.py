@@ -28,7 +28,13 @@ from naibu.imaging.volume_correlation.correlate import (
     UNSETTLED,
     Correlation,
 )
-from naibu.imaging.volume_correlation.gauss_newton import SAMPLE_TOLERANCE, SAMPLES_AT_ONCE, STEP_TOLERANCE, STILL
+from naibu.imaging.volume_correlation.gauss_newton import (
+    COVARIANCE_TOLERANCE,
+    SAMPLE_TOLERANCE,
+    SAMPLES_AT_ONCE,
+    STEP_TOLERANCE,
+    STILL,
+)
 from naibu.imaging.volume_correlation.image_level import GAIN_RANGE, GainMap, most_probable_gain
 from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
@@ -292,7 +298,7 @@ class SummedEquations:
             self.coarse.c[self.system.active] += step
 
     def _samples(self, draws: Float32Array, seed: int | None = None) -> Float32Array:
-        """Return random coefficients (n, 3, s) from the random loads of all blocks; with a seed inclusions have random motions, too."""
+        """Return random coefficients (n, 3, s) from the random loads of all blocks, those of the covariance with a seed of their own."""
         coarse, system = self.coarse, self.system
         out, dilatation = np.empty_like(draws), coarse.dilatation * system.gauss_volume
         rng = np.random.default_rng((coarse.settings.seed if seed is None else seed, self.model.passes))
@@ -304,7 +310,7 @@ class SummedEquations:
                 randoms = (noise.draw(rng) for _ in range(loads.shape[2]))
                 loads += self.fit.inclusion_loads([[inclusion.perturbed(r, rng) for inclusion in coarse.inclusions] for r in randoms])
             system.add_penalty_noise(loads, coarse.c, coarse.bending, dilatation, rng)
-            out[:, :, some] = system.solved_many(loads, SAMPLE_TOLERANCE)[0]
+            out[:, :, some] = system.solved_many(loads, SAMPLE_TOLERANCE if seed is None else COVARIANCE_TOLERANCE)[0]
         return out
 
     def _inclusion_noise(self) -> ResidualNoise:

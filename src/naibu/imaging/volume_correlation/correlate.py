@@ -31,6 +31,7 @@ from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated, require_convergence, require_overlap
 from naibu.imaging.volume_correlation.gauss_newton import (
     INSIDE_INCLUSION,
+    SAMPLE_TOLERANCE,
     STEP_TOLERANCE,
     CorrelationFit,
     Iterations,
@@ -323,10 +324,10 @@ class Correlation:
         self.release(fit.cell_misfit(), lambda: fit.noise_samples(DRAWS, self.noise(), s.seed), self.settle_released)
         for k in range(ADAPTATIONS):
             report_progress(self.progress, "weights of the penalties", done=k, total=ADAPTATIONS)
-            samples = fit.samples(self.c, self.bending, self.dilatation * system.gauss_volume, ADAPTATION_SAMPLES, None, s.seed)
-            settled = self.reweigh(samples)
-            iterations = Iterations(ADAPTED_STEPS, unsettled=UNSETTLED)
-            self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, iterations)
+            weights = self.bending, self.dilatation * system.gauss_volume
+            settled = self.reweigh(fit.samples(self.c, *weights, ADAPTATION_SAMPLES, None, s.seed, SAMPLE_TOLERANCE))
+            steps = Iterations(ADAPTED_STEPS, unsettled=UNSETTLED)
+            self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, steps)
             if settled:
                 break
         self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, POLISH)
@@ -421,9 +422,8 @@ class Correlation:
         for inclusion in self.inclusions:
             inclusion.draws.clear()
         noise = self.noise()
-        samples = fit.samples(
-            self.c, self.bending, self.dilatation * system.gauss_volume, self.settings.samples, noise, self.settings.seed + 1
-        )
+        dilatation = self.dilatation * system.gauss_volume
+        samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
         blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2)
         weights = self.bending, self.dilatation
         found = collected(self.volume, fit, self.c, samples, *weights, content.matched, fit.cell_misfit(), loose)

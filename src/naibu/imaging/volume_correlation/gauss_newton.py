@@ -21,9 +21,9 @@ from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion
 
-# relative accuracy of the linear solves: a Gauss-Newton step is repeated, a random field is not, and conjugate gradients find its smooth
-# part last, which is most of it under stiff penalties
-STEP_TOLERANCE, SAMPLE_TOLERANCE = 0.1, 0.01
+# relative accuracy of the linear solves: a Gauss-Newton step is repeated, and random fields by which weights are chosen need not be exact;
+# those of the covariance do, since conjugate gradients find the smooth part last, which is most of it under stiff penalties
+STEP_TOLERANCE, SAMPLE_TOLERANCE, COVARIANCE_TOLERANCE = 0.1, 0.06, 0.003
 SAMPLES_AT_ONCE = 16  # right sides of one solve, which bound the memory
 # empirical, fractions of the unknowns: at least so many count as determined by the data of a kind, and a cell's own weight starts from the
 # common one with the worth of so many
@@ -190,11 +190,19 @@ class CorrelationFit(IntensityComparison):
         return np.ascontiguousarray(root @ clipped @ inverse, dtype=np.float32)
 
     def samples(
-        self, c: FloatArray, bending: FloatArray, dilatation: FloatArray, count: int, noise: ResidualNoise | None, seed: int
+        self,
+        c: FloatArray,
+        bending: FloatArray,
+        dilatation: FloatArray,
+        count: int,
+        noise: ResidualNoise | None,
+        seed: int,
+        tolerance: float = COVARIANCE_TOLERANCE,
     ) -> Float32Array:
         """Return random coefficients (n, 3, count), mm, about c, distributed as its error :cite:p:`papandreou2010`.
 
-        Without `noise` the residuals of voxels are independent, and the covariance is the inverse of the normal matrix.
+        Without `noise` the residuals of voxels are independent, and the covariance is the inverse of the normal matrix. `tolerance` is the
+        relative accuracy of the linear solves.
         """
         out = np.empty((self.system.n, 3, count), np.float32)
         sensitivity = self.gradient * np.sqrt(self.weight)[:, None]
@@ -204,7 +212,7 @@ class CorrelationFit(IntensityComparison):
             rng, many = np.random.default_rng((seed, first)), min(SAMPLES_AT_ONCE, count - first)
             loads = self._random_loads(sensitivity, many, noise, rng)
             self.system.add_penalty_noise(loads, c, bending, dilatation, rng)
-            out[:, :, first : first + SAMPLES_AT_ONCE] = self.system.solved_many(loads, SAMPLE_TOLERANCE)[0]
+            out[:, :, first : first + SAMPLES_AT_ONCE] = self.system.solved_many(loads, tolerance)[0]
         return out
 
     def noise_samples(self, count: int, noise: ResidualNoise, seed: int) -> Float32Array:
