@@ -29,9 +29,8 @@ NARROWEST = 0.004  # standard deviation of relative changes of the values around
 SPREAD = 2.0  # of these deviations over those of the estimate: what jumps pretend falls with the square
 EXCHANGES = 100
 WIDEST = (0.01, 0.06, 0.24)  # largest one: at least, at first, and at most
-PAYS = (
-    4.0  # by how much less a regression must leave of the simulations where these are half as far away: what they left then was curvature
-)
+# by how much less a regression must leave of the simulations where these are half as far away: what they left then was curvature
+PAYS = 4.0
 ROUNDS = 8
 REACHES = 2.0  # of these deviations, how far a step follows a regression
 WORTH = 3.0  # decrease of chi-squared for each parameter that is worth another round
@@ -219,10 +218,9 @@ def _told(information: FloatArray, spurious: FloatArray) -> FloatArray:
 class LocalRegression:
     """Rounds of regression from the end of a search on.
 
-    In every round the lattice is simulated on both sides along random orthogonal directions, as far away as is typical of the
-    covariance, but     no farther than the linear model holds. Both steps of the regression are simulated, the better one is taken.
-    Once steps stay within the     covariance and chi-squared falls no longer, fine steps of time at a few points tell what to add to
-    residuals of long ones.
+    In every round the lattice is simulated on both sides along random orthogonal directions, as far away as is typical of the covariance,
+    but no farther than the linear model holds. Both steps of the regression are simulated, the better one is taken. Once steps stay within
+    the covariance and chi-squared falls no longer, fine steps of time at a few points tell what to add to residuals of long ones.
 
     Attributes
     ----------

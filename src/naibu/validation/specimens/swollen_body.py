@@ -6,7 +6,7 @@ A sphere changes its volume by one factor everywhere, and the medium about it ke
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,7 +71,6 @@ def swollen_body(
     seed: int,
     noise: float = 5.0,
     shift_mm: Sequence[float] = (0.6, -0.3, 0.4),
-    plain: Callable[[FloatArray], FloatArray] | None = None,
 ) -> SwollenBody:
     """Return the pair of scans, of voxels of 1 mm.
 
@@ -85,15 +84,13 @@ def swollen_body(
         Standard deviation of the intensities of both scans, whose texture has one of 30.
     shift_mm : sequence of float, shape (3,)
         By which the body is shifted in the end.
-    plain : callable, optional
-        Fraction of the texture (...,) that material points (..., 3), mm, lack.
     """
     frame = Volume.from_array(np.zeros(SHAPE), spacing_mm=(1.0, 1.0, 1.0))
     x, grey, rng = positions(frame), Texture.drawn(TEXTURE_MM, seed=seed), np.random.default_rng([seed, 4])
 
     def seen(p: FloatArray) -> FloatArray:
         inside = 1.0 / (1.0 + np.exp((_out(p) - 1.0) / EDGE))
-        texture = TEXTURE * grey(p.reshape(-1, 3)).reshape(inside.shape) * (1.0 if plain is None else 1.0 - plain(p))
+        texture = TEXTURE * grey(p.reshape(-1, 3)).reshape(inside.shape)
         return np.asarray(AIR + inside * (TISSUE - AIR + texture) + rng.normal(0.0, noise, inside.shape))
 
     forward, ratio, back = x, np.ones(SHAPE), x - np.asarray(shift_mm)
