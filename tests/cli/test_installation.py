@@ -11,7 +11,7 @@ import numba
 import pytest
 
 from naibu import datasets
-from naibu._numba import simd
+from naibu._numba.intrinsics import simd
 from naibu.cli import installation
 from naibu.core.errors import InputError
 from naibu.mechanics.linear_algebra import direct

@@ -23,8 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from naibu._numba.atomics import ATOMIC, add, look, nap, post, relax, swap, ticks
 from naibu._numba.compilation import njit
+from naibu._numba.intrinsics.atomics import ATOMIC, add, look, nap, post, relax, swap, ticks
 from naibu.core.arrays import IntArray
 from naibu.core.cores import usable_cores
 

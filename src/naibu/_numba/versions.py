@@ -1,8 +1,8 @@
 """Which versions of Numba the intrinsics and the kernel cache were tested with, and what happens on others.
 
-Intrinsics (`naibu._numba._vectors`, `naibu._numba._atomic_intrinsics`) write LLVM instructions, and the cache serializes compiled
-functions; both rely on interfaces that Numba may change from one minor version to the next. On a tested version they are used as they are;
-on another one only after a trial, otherwise the plain substitute is used.
+Intrinsics (`naibu._numba.intrinsics`) write LLVM instructions, and the cache serializes compiled functions; both rely on interfaces
+that Numba may change from one minor version to the next. On a tested version they are used as they are; on another one only after a trial,
+otherwise the plain substitute is used.
 """
 
 from __future__ import annotations

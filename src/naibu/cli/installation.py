@@ -196,9 +196,9 @@ def _has_layer(layer: str) -> bool:
 def _kernels_row() -> DoctorRow:
     name, purpose = "kernels", "Numba's inner interfaces: vectors and threads of lattices, the cache"
     try:
-        from naibu._numba.atomics import ATOMIC
         from naibu._numba.compilation import cache_works
-        from naibu._numba.simd import VECTORS
+        from naibu._numba.intrinsics.atomics import ATOMIC
+        from naibu._numba.intrinsics.simd import VECTORS
         from naibu._numba.versions import TESTED, tested
 
         parts = {"SIMD vectors": VECTORS, "thread pool": ATOMIC, "cache": cache_works()}

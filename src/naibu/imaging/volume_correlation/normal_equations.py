@@ -10,7 +10,7 @@ from itertools import islice
 
 import numpy as np
 
-from naibu._numba.simd import WIDTH
+from naibu._numba.intrinsics.simd import WIDTH
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from naibu.imaging.volume_correlation._sample_kernels import add_random_forces, products_of_many
 from naibu.imaging.volume_correlation._spline_kernels import add_forces, add_noise, assemble, product, sample_energies

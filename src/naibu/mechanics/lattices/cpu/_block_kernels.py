@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu._numba.simd import WIDTH
+from naibu._numba.intrinsics.simd import WIDTH
 
 _STRIDE = 4  # a neighbour along y, z or a diagonal, and the two beside it along x, overlap
 _ODD = np.uint64(0x9E3779B97F4A7C15)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu._numba.simd import WIDTH, aligned, load, splat, store
+from naibu._numba.intrinsics.simd import WIDTH, aligned, load, splat, store
 from naibu.core.arrays import AnyArray
 
 FACES, NODES = range(2)

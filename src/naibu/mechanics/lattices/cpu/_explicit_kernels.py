@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu._numba.simd import WIDTH, inverse_root, load, splat, store
+from naibu._numba.intrinsics.simd import WIDTH, inverse_root, load, splat, store
 from naibu._numba.thread_pool import JOB, begin_step, end_job, end_step, finish, first_part, following_part, next_part
 
 _FAST = {"contract", "nsz"}

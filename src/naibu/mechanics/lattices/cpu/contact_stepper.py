@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from naibu._numba.packed_tuples import packed
+from naibu._numba.intrinsics.packed_tuples import packed
 from naibu.core.arrays import AnyArray, FloatArray
 from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geometries
 from naibu.mechanics.contact.indenter_motion import SHARE, step_parts

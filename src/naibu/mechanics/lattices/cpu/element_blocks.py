@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from naibu._numba.simd import WIDTH, aligned
+from naibu._numba.intrinsics.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, BoolArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu._block_kernels import add_to_keys, cover, in_order, mark_filled, number_kinds, tabulate
 from naibu.mechanics.lattices.cpu.implicit.coarse_space import coarse_space

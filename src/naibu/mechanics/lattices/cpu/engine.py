@@ -10,7 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu._numba.simd import WIDTH, aligned
+from naibu._numba.intrinsics.simd import WIDTH, aligned
 from naibu._numba.thread_pool import MOST_PARTS
 from naibu.core.arrays import AnyFloatArray, FloatArray
 from naibu.core.errors import ConvergenceError, InputError

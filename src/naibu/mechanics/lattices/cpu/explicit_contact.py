@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from naibu._numba.simd import WIDTH, aligned
+from naibu._numba.intrinsics.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, FloatArray
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel
 from naibu.mechanics.lattices.cpu.implicit.coarse_space import no_coarse_space

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from naibu._numba.simd import WIDTH, aligned
+from naibu._numba.intrinsics.simd import WIDTH, aligned
 from naibu._numba.thread_pool import new_control
 from naibu.core.arrays import AnyArray, AnyFloatArray, FloatArray
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 
 KernelTuple = tuple[Any, ...]  # arrays and numbers as kernels take them, in nested tuples, whose types Numba works out
-PackedArguments = Any  # of `naibu._numba.packed_tuples.packed`
+PackedArguments = Any  # of `naibu._numba.intrinsics.packed_tuples.packed`
 Scratch = tuple[KernelTuple, KernelTuple]
 
 

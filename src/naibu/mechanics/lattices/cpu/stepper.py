@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from naibu._numba.packed_tuples import packed
-from naibu._numba.simd import aligned
+from naibu._numba.intrinsics.packed_tuples import packed
+from naibu._numba.intrinsics.simd import aligned
 from naibu._numba.thread_pool import IDLE, PARTS, STOP, new_control, start_workers, stop_workers
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu._explicit_kernels import explicit_steps, explicit_worker

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from naibu._numba.compilation import njit
-from naibu._numba.simd import WIDTH, aligned, inverse_root, load, splat, store
+from naibu._numba.intrinsics.simd import WIDTH, aligned, inverse_root, load, splat, store
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.lattices.cpu._explicit_kernels import drive, element_forces, move

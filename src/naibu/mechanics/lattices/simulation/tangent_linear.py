@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu._numba.compilation import njit
-from naibu._numba.simd import WIDTH, aligned, inverse_root, load, splat, store
+from naibu._numba.intrinsics.simd import WIDTH, aligned, inverse_root, load, splat, store
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine

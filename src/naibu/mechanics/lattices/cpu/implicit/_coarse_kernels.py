@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
-from naibu._numba.simd import WIDTH, load, splat, store, total
+from naibu._numba.intrinsics.simd import WIDTH, load, splat, store, total
 
 _FAST = {"contract", "nsz"}
 # places in the memory: constrained components known of, inverse in use, work done, and work from which on a new inverse costs little;

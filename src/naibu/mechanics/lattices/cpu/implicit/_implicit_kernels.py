@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
-from naibu._numba.simd import WIDTH, load, splat, store
+from naibu._numba.intrinsics.simd import WIDTH, load, splat, store
 from naibu._numba.thread_pool import begin_step, end_step
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, ROOM, add_contact
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with, follow

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu._numba.simd import WIDTH, double, load, single, splat, store, total
+from naibu._numba.intrinsics.simd import WIDTH, double, load, single, splat, store, total
 from naibu._numba.thread_pool import end_job, first_part, following_part
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import gather, turn_with
 

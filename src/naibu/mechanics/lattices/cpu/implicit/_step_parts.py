@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu._numba.simd import WIDTH, inverse_root, load, single, splat, store, total
+from naibu._numba.intrinsics.simd import WIDTH, inverse_root, load, single, splat, store, total
 from naibu._numba.thread_pool import JOB, end_job, finish, first_part, following_part, next_part
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import POOL, SOLVER_JOBS, part_entries, solver_part
 

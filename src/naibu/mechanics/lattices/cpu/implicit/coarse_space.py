@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.packed_tuples import packed
-from naibu._numba.simd import WIDTH, aligned
+from naibu._numba.intrinsics.packed_tuples import packed
+from naibu._numba.intrinsics.simd import WIDTH, aligned
 from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import NODES, PLAIN, PRICE, assemble, build, no_contacts
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple

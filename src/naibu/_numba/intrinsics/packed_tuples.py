@@ -15,7 +15,7 @@ import numba
 from naibu._numba.versions import passes
 
 try:
-    from naibu._numba import _packed_type
+    from naibu._numba.intrinsics import _packed_type
 except Exception:  # whatever a changed interface raises
     PACKED = False
 else:

@@ -1,4 +1,4 @@
-"""Vectors of eight numbers in Numba kernels, as LLVM vector types: see `naibu._numba.simd`, which is to be imported instead."""
+"""Vectors of eight numbers in Numba kernels, as LLVM vector types: see `naibu._numba.intrinsics.simd`, which is to be imported instead."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plain operations for one thread: the substitute of `naibu._numba._atomic_intrinsics` where its intrinsics do not work."""
+"""Plain operations for one thread: the substitute of `naibu._numba.intrinsics._atomic_intrinsics` where its intrinsics do not work."""
 
 from __future__ import annotations
 

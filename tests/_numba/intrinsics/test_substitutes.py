@@ -10,15 +10,16 @@ import numba
 import numpy as np
 import pytest
 
-from naibu._numba import _atomic_intrinsics, _vectors, versions
+from naibu._numba import versions
+from naibu._numba.intrinsics import _atomic_intrinsics, _vectors
 
 RUN = """
 import sys
 import numpy as np
 {}
-from naibu._numba.atomics import ATOMIC
-from naibu._numba.packed_tuples import PACKED
-from naibu._numba.simd import VECTORS, WIDTH
+from naibu._numba.intrinsics.atomics import ATOMIC
+from naibu._numba.intrinsics.packed_tuples import PACKED
+from naibu._numba.intrinsics.simd import VECTORS, WIDTH
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
@@ -36,14 +37,15 @@ np.savez(sys.argv[1], *found)
 print(VECTORS, WIDTH, ATOMIC, PACKED)
 """
 UNTESTED = "import numba; numba.__version__ = '0.99.0'"
-WITHOUT_INTRINSICS = "import sys, numba.extending; del numba.extending.intrinsic; sys.modules['naibu._numba._packed_type'] = None"
+PACKED_TYPE = "naibu._numba.intrinsics._packed_type"
+WITHOUT_INTRINSICS = f"import sys, numba.extending; del numba.extending.intrinsic; sys.modules['{PACKED_TYPE}'] = None"
 OTHER_INSTRUCTIONS = f"{UNTESTED}\nfrom llvmlite import ir; del ir.IRBuilder.shuffle_vector; del ir.IRBuilder.load_atomic"
 OTHER_RESULTS = f"{UNTESTED}\nfrom numba.core.compiler import CompileResult; del CompileResult._reduce"
 ASK = """
 {}
-from naibu._numba.atomics import ATOMIC
+from naibu._numba.intrinsics.atomics import ATOMIC
 from naibu._numba.compilation import cache_works, njit
-from naibu._numba.simd import VECTORS
+from naibu._numba.intrinsics.simd import VECTORS
 
 @njit(cache=True)
 def twice(x):

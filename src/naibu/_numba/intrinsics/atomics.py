@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from naibu._numba import _plain_operations
+from naibu._numba.intrinsics import _plain_operations
 from naibu._numba.versions import passes
 
 _chosen: Any = _plain_operations
 try:
-    from naibu._numba import _atomic_intrinsics
+    from naibu._numba.intrinsics import _atomic_intrinsics
 except Exception:  # whatever a changed interface raises
     ATOMIC = False
 else:

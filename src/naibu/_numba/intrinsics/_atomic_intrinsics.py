@@ -1,4 +1,4 @@
-"""Atomic operations on arrays in Numba kernels, a short sleep and a clock: see `naibu._numba.atomics`, which is to be imported instead."""
+"""Atomic operations on arrays in Numba kernels, a short sleep and a clock: import `naibu._numba.intrinsics.atomics` instead."""
 
 from __future__ import annotations
 

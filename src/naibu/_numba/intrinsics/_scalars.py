@@ -1,4 +1,4 @@
-"""One number at a time in place of eight: the substitute of `naibu._numba._vectors` where its intrinsics do not work."""
+"""One number at a time in place of eight: the substitute of `naibu._numba.intrinsics._vectors` where its intrinsics do not work."""
 
 from __future__ import annotations
 

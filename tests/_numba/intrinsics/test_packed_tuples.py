@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from naibu._numba import packed_tuples
 from naibu._numba.compilation import njit
-from naibu._numba.packed_tuples import packed
+from naibu._numba.intrinsics import packed_tuples
+from naibu._numba.intrinsics.packed_tuples import packed
 
 
 @njit

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from naibu._numba import _scalars
+from naibu._numba.intrinsics import _scalars
 from naibu._numba.versions import passes
 
 _chosen: Any = _scalars
 try:
-    from naibu._numba import _vectors
+    from naibu._numba.intrinsics import _vectors
 except Exception:  # whatever a changed interface raises
     VECTORS = False
 else:

@@ -1,5 +1,5 @@
 # mypy: disallow-untyped-calls=False, disallow-untyped-decorators=False, warn-unused-ignores=False
-"""The Numba type of tuples that kernels read from memory: see `naibu._numba.packed_tuples`, which is to be imported instead."""
+"""The Numba type of tuples that kernels read from memory: see `naibu._numba.intrinsics.packed_tuples`, which is to be imported instead."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def _class_of(kind: PackedTuple) -> type[Packed]:
 
 
 def packed(*items: Any) -> Packed:
-    """Return arguments in memory; see `naibu._numba.packed_tuples.packed`."""
+    """Return arguments in memory; see `naibu._numba.intrinsics.packed_tuples.packed`."""
     kind = _type_of(items)
     memory = np.zeros(max(kind.starts[-1], 1), dtype=np.int64)
     _fill(memory, kind, items)
