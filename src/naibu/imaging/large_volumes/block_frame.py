@@ -101,7 +101,7 @@ class BlockFrame:
         """Return the coordinates (3,) of the voxel with the indices x, y, z, mm."""
         return np.array([self.along(axis, index[axis]) for axis in range(3)])
 
-    def along(self, axis: int, index: IntArray) -> FloatArray:
+    def along(self, axis: int, index: IntArray | FloatArray) -> FloatArray:
         """Return the coordinates of voxels with indices along an axis, 0 for x, mm."""
         return np.asarray((index - self.offset) * self.spacing[axis])
 

@@ -99,7 +99,7 @@ class ComparedBlock:
         z, y, x of the cells.
     matrix, load, draws : ndarray, shape (k, 3, 1029), (k, 3) and (k, 3, s)
         Of the intensities alone: normal matrix, load, random loads.
-    agreement, misfit, content : ndarray, shape (m, 12), (m, 3) and (m, 8)
+    agreement, misfit, content : ndarray, shape (m, 12), (m, 3) and (m, 13)
         See `CorrelationFit.cell_agreement`, `CorrelationFit.cell_misfit` and `content_sums`.
     products, pairs : ndarray
         Sums of products of residuals, and their numbers, by distance.

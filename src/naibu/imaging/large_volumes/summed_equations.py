@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import AnyFloatArray, Float32Array, FloatArray, IntArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
@@ -38,7 +38,7 @@ from naibu.imaging.volume_correlation.gauss_newton import (
 from naibu.imaging.volume_correlation.image_level import GAIN_RANGE, GainMap, most_probable_gain
 from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
-from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, displacement_of_blocks
+from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, blocks_alike, displacement_of_blocks
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
 
 # Gauss-Newton steps: the first of them with voxels of an edge in between, where there are such, and the one in which weights are adapted
@@ -217,11 +217,13 @@ class SummedEquations:
         fit.gain, fit.offset = self.lattice.values(model.gain)
         fit.residual_sd = model.residual_sd
         weights = coarse.bending, coarse.dilatation
-        found = collected(coarse.volume, fit, coarse.c, samples, *weights, content.matched, sums.misfit, loose)
-        return replace(found, blocks=self._small_blocks(sums.small, scale) if sums.small else None)
+        found = collected(coarse.volume, fit, coarse.c, samples, *weights, content, sums.misfit, loose)
+        return replace(found, blocks=self._small_blocks(sums.small, scale, content.unlike) if sums.small else None)
 
-    def _small_blocks(self, parts: list[BlockSums], scale: float) -> DisplacementField:
-        joined = BlockSums.joined(parts)
+    def _small_blocks(self, parts: list[BlockSums], scale: float, unlike: BoolArray) -> DisplacementField:
+        every, frame = BlockSums.joined(parts), self.frame
+        middle_mm = np.stack([frame.along(a, every.middle[:, a]) for a in range(3)], axis=1)
+        joined = blocks_alike(self.system, every, middle_mm, unlike)
         # tiles are drawn without the factor that forces lose by robustness
         scaled = replace(joined, drawn=scale * joined.drawn)
         return displacement_of_blocks(self.volume.grid, scaled, self.frame.spacing, scale)

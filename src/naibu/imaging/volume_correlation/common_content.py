@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray
 from naibu.core.errors import InputError
@@ -28,6 +29,13 @@ MATCHED_IF_STRUCTURED, MUCH_STRUCTURE = 0.6, 0.25
 # voxel, 0.3 where both volumes show different things
 STRUCTURED = 0.15
 LAG = 2
+# empirical: autocovariance of the residual, without robust weights, LAG voxels apart: in that of the reference, and in residual variances,
+# above which a cell shows in one volume what is not in the other. A counterpart leaves 0.3 and 0.25 at most, none 1 (the texture of one
+# volume) or 2 (of both) and more. Noise has none, however much of it there is. Beside such a cell, into which what it shows may reach, less
+# is enough
+UNLIKE, LEAST_UNLIKE = 0.5, 0.25
+BESIDE, LEAST_BESIDE = 0.15, 0.15
+NARROW = 0.5  # cells: SD of the window in which they are compared, as narrow as so few voxels allow: what appears may be thin
 WINDOWS = (1.0, 2.0, 4.0)  # cells: SDs of the windows in which a cell is judged, the first that holds enough of the inside
 SURFACE = 1.5  # cells: depth below which a voxel may show the contrast of the surface
 LEAST_VOXELS = 40  # of the inside of the object in a window; thinner objects are judged by their surface, too
@@ -47,10 +55,13 @@ class CommonContent:
         is left out: it says how the object is bounded, and not how what is inside has moved.
     structure : ndarray, shape (m,)
         Autocorrelation of the residual two voxels apart.
+    unlike : ndarray, shape (m,), bool
+        Cells that show in one volume what is not in the other: see `unlike_cells`.
     """
 
     agreement: FloatArray
     structure: FloatArray
+    unlike: BoolArray
 
     @property
     def matched(self) -> BoolArray:
@@ -105,7 +116,7 @@ def common_content(fit: CorrelationFit, depth_mm: Float32Array) -> CommonContent
 
 
 def content_sums(fit: CorrelationFit, depth_mm: Float32Array) -> FloatArray:
-    """Return sums (m, 8) over the voxels of every cell, from which `content_of` follows."""
+    """Return sums (m, 13) over the voxels of every cell, from which `content_of` follows."""
     inside = depth_mm > SURFACE * float(fit.system.grid.step_mm.mean())
     traces = np.stack([fit.agreement[:, axes].sum(axis=1) for axes in ([0, 3, 5], [6, 9, 11])], axis=1)
     # steep edges show an outline, also that of another object: they count by the jitter of the settings, however well they fit
@@ -114,32 +125,64 @@ def content_sums(fit: CorrelationFit, depth_mm: Float32Array) -> FloatArray:
     traces *= lower[:, None]
     every = np.column_stack([traces, np.ones(len(traces))])
     residual = fit.residual * np.sqrt(fit.weight * lower)
-    columns = [*every.T, *(every * inside[:, None]).T, _lagged(fit, residual), residual**2]
+    columns = [*every.T, *(every * inside[:, None]).T, _lagged(fit, residual, residual), residual**2, *_lagged_intensities(fit)]
     sums = np.zeros((len(fit.system.cells), len(columns)))
     add_to_cells(fit.cell_of_voxel, np.stack(columns, axis=1), sums)
     return sums
 
 
 def content_of(fit: CorrelationFit, cells: FloatArray) -> CommonContent:
-    """Return what cells have in common from the sums (m, 8) of `content_sums`."""
+    """Return what cells have in common from the sums (m, 13) of `content_sums`."""
     sums = cells[:, :3], cells[:, 3:6]
     judged = fit.windowed(sums[0], WINDOWS[0])
     for width in WINDOWS[::-1]:
         deep = fit.windowed(sums[1], width) * (2.0 * np.sqrt(np.pi) * width) ** 3
         judged = np.where(deep[:, 2:] > LEAST_VOXELS, deep, judged)
-    structure = [fit.windowed(v, WINDOWS[0]) for v in cells[:, 6:].T]
-    return CommonContent(judged[:, 0] / np.maximum(judged[:, 1], 1e-30), structure[0] / np.maximum(structure[1], 1e-30))
+    product, square = (fit.windowed(v, WINDOWS[0]) for v in cells[:, 6:8].T)
+    agreement, structure = judged[:, 0] / np.maximum(judged[:, 1], 1e-30), product / np.maximum(square, 1e-30)
+    return CommonContent(agreement, structure, unlike_cells(fit, cells[:, 8:]))
 
 
-def _lagged(fit: CorrelationFit, residual: Float32Array) -> Float32Array:
-    """Return the mean products (n,) of residuals and those of the voxels LAG further along the axes of the finest voxels."""
+def unlike_cells(fit: CorrelationFit, lagged: FloatArray) -> BoolArray:
+    """Return the cells (m,) that show in one volume what is not in the other, such as a bubble, a needle, or tissue that was cut away.
+
+    `lagged` (m, 5) are sums of products, `LAG` voxels apart: of residuals, of intensities, of either of these alone, and of ones.
+
+    Notes
+    -----
+    Voxels of such a cell count little, as all large residuals do, so that gradients agree as they do next to them. But the residual of what
+    has no counterpart is as large as what is shown: the normalised sum of squared differences :cite:p:`pan2010` is that of unrelated
+    images. Products at a distance are taken in place of squares, in which noise would have to be known.
+    """
+    left, shown, first, second, pairs = (fit.windowed(v, NARROW) for v in lagged.T)
+    some = np.maximum(pairs, 1e-30)
+    left, shown = left / some, shown / some - first * second / some**2
+    dense = np.zeros(tuple(int(n) for n in fit.system.grid.cells[::-1]), dtype=bool)
+    at = tuple(fit.system.cells[:, 2:].T)
+    dense[at] = (left > LEAST_UNLIKE) & (left > UNLIKE * shown)
+    near = ndimage.binary_dilation(dense, np.ones((3, 3, 3), dtype=bool))[at]
+    return np.asarray(dense[at] | (near & (left > LEAST_BESIDE) & (left > BESIDE * shown)))
+
+
+def _lagged_intensities(fit: CorrelationFit) -> list[Float32Array]:
+    """Return mean products (n,) with the voxels LAG further: of residuals, intensities, their first and second factor, and of ones."""
+    seen = fit.seen.astype(np.float32)
+    # about their mean, which does not matter but for rounding
+    intensity = seen * (fit.level.intensity - fit.level.intensity.mean()) / np.float32(fit.residual_sd)
+    residual = seen * fit.residual / np.float32(fit.residual_sd)
+    pairs = ((residual, residual), (intensity, intensity), (intensity, seen), (seen, intensity), (seen, seen))
+    return [_lagged(fit, *pair) for pair in pairs]
+
+
+def _lagged(fit: CorrelationFit, values: Float32Array, others: Float32Array) -> Float32Array:
+    """Return the mean products (n,) of values and others of the voxels LAG further along the axes of the finest voxels."""
     spacing = fit.level.spacing
     axes = [2 - a for a in range(3) if spacing[a] < 1.5 * spacing.min() and fit.level.mask.shape[2 - a] > LAG]
-    box, total = np.zeros(fit.level.mask.shape, np.float32), np.zeros(fit.level.mask.shape, np.float32)
-    box[fit.level.mask] = residual
+    first, second, total = (np.zeros(fit.level.mask.shape, np.float32) for _ in range(3))
+    first[fit.level.mask], second[fit.level.mask] = values, others
     for axis in axes:
         here, there = (tuple(s if a == axis else slice(None) for a in range(3)) for s in (slice(None, -LAG), slice(LAG, None)))
-        total[here] += box[here] * box[there] / len(axes)
+        total[here] += first[here] * second[there] / len(axes)
     return np.asarray(total[fit.level.mask])
 
 

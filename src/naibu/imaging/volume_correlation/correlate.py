@@ -424,9 +424,9 @@ class Correlation:
         noise = self.noise()
         dilatation = self.dilatation * system.gauss_volume
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
-        blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2)
+        blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2, content.unlike)
         weights = self.bending, self.dilatation
-        found = collected(self.volume, fit, self.c, samples, *weights, content.matched, fit.cell_misfit(), loose)
+        found = collected(self.volume, fit, self.c, samples, *weights, content, fit.cell_misfit(), loose)
         return replace(found, blocks=blocks)
 
 

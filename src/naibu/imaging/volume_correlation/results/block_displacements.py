@@ -20,6 +20,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.volume import Volume
 from naibu.imaging.volume_correlation._warp_kernels import add_to_cells
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
+from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
 
 BLOCKS = 8000  # about as many are made
@@ -65,7 +66,7 @@ class BlockSums:
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
-def block_displacements(volume: Volume, fit: CorrelationFit, noise: ResidualNoise, seed: int) -> DisplacementField:
+def block_displacements(volume: Volume, fit: CorrelationFit, noise: ResidualNoise, seed: int, unlike: BoolArray) -> DisplacementField:
     """Return the displacement of blocks of voxels, with covariance; errors of different blocks are independent.
 
     Parameters
@@ -78,11 +79,14 @@ def block_displacements(volume: Volume, fit: CorrelationFit, noise: ResidualNois
         Draws residuals that are correlated like those measured, by which the covariance of independent ones is scaled.
     seed : int
         Of these draws.
+    unlike : ndarray, shape (m,), bool
+        Cells whose content is not in both volumes: blocks there are left out.
     """
     inner = below_surface(np.pad(fit.level.mask, RIM))[fit.level.mask] & fit.seen
     rng = np.random.default_rng(seed)
     sums = sums_of_blocks(fit, inner, block_edge(int(inner.sum())), (noise.draw(rng) for _ in range(DRAWS)))
-    return displacement_of_blocks(volume, sums, fit.level.spacing, noise.scale)
+    alike = blocks_alike(fit.system, sums, sums.middle * fit.level.spacing, unlike)
+    return displacement_of_blocks(volume, alike, fit.level.spacing, noise.scale)
 
 
 def below_surface(mask: BoolArray) -> BoolArray:
@@ -125,6 +129,14 @@ def _numbers(mask: BoolArray, edge: int) -> IntArray:
     nz, ny, _ = (-(-n // edge) for n in mask.shape)
     z, y, x = np.ogrid[tuple(slice(n) for n in mask.shape)]
     return np.asarray((((x // edge) * ny + y // edge) * nz + z // edge)[mask])
+
+
+def blocks_alike(system: SplineSystem, sums: BlockSums, middle_mm: FloatArray, unlike: BoolArray) -> BlockSums:
+    """Return the blocks whose middles (k, 3), mm, do not lie in cells (m,) that are `unlike` in both volumes."""
+    dense = np.zeros(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
+    dense[tuple(system.cells[unlike, 2:].T)] = True
+    x, y, z = (system.grid.table(a, middle_mm[:, a])[0] for a in range(3))
+    return BlockSums(*(getattr(sums, f.name)[~dense[z, y, x]] for f in fields(sums)))
 
 
 def displacement_of_blocks(volume: Volume, sums: BlockSums, spacing: FloatArray, scale: float) -> DisplacementField:

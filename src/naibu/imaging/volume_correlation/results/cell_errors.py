@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import Float32Array, FloatArray, IntArray
+from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 
@@ -77,13 +77,15 @@ def bias_variance(fit: CorrelationFit, bias: Sequence[Float32Array]) -> FloatArr
     return np.asarray(total / count)
 
 
-def misplacement_variance(fit: CorrelationFit, misfit: FloatArray) -> FloatArray:
+def misplacement_variance(fit: CorrelationFit, misfit: FloatArray, unlike: BoolArray | None = None) -> FloatArray:
     """Return the variance (m,), mm^2 along every axis, of displacements that would leave the residuals beyond `MISPLACED` in a cell.
 
-    A displacement by e leaves residuals g.e in a gradient g. Cells next to such a cell share its splines, and their errors.
+    A displacement by e leaves residuals g.e in a gradient g. Cells next to such a cell share its splines, and their errors. In cells (m,)
+    that are `unlike` in both volumes all that is beyond the noise counts.
     """
     residuals, gradients, count = misfit.T
-    excess = residuals - MISPLACED * fit.residual_sd**2 * count
+    least = MISPLACED if unlike is None else np.where(unlike, 1.0, MISPLACED)
+    excess = residuals - least * fit.residual_sd**2 * count
     of_cell = per_cell(fit.system.grid, fit, np.maximum(excess, 0.0) / np.maximum(gradients, 1e-30))
     return np.asarray(ndimage.maximum_filter(np.nan_to_num(of_cell), 3)[tuple(fit.system.cells[:, 2:].T)])
 

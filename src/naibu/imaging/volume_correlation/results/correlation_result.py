@@ -14,6 +14,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
+from naibu.imaging.volume_correlation.common_content import CommonContent
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.results.cell_errors import (
     REMAINING,
@@ -37,8 +38,8 @@ class CorrelationResult:
     Attributes
     ----------
     displacement : DisplacementField
-        At the voxels of the reference; valid in the object, where it lies in the deformed volume after its motion, NaN elsewhere. Its
-        covariance is not stored for all voxels: see `covariance`, `covariance_at` and `at_points`.
+        At the voxels of the reference; valid in the object, where it lies in the deformed volume after its motion and both volumes show
+        the same, NaN elsewhere. Its covariance is not stored for all voxels: see `covariance`, `covariance_at` and `at_points`.
     grid : SplineGrid
         Spline grid, along the axes of the volume.
     coefficients : ndarray, shape (NZ, NY, NX, 3)
@@ -280,15 +281,15 @@ def collected(
     samples: Float32Array,
     bending: FloatArray,
     dilatation: FloatArray,
-    matched: BoolArray,
+    content: CommonContent,
     misfit: FloatArray,
     loose: Float32Array,
 ) -> CorrelationResult:
     """Return the result of a fit at full resolution.
 
-    `samples` (n, 3, s) are random coefficients about c. Soft cells (m,) that are not matched are not answered. `misfit` (m, 3) is that of
-    `CorrelationFit.cell_misfit` at full resolution, and `loose` (n, 3), mm, how the coefficients would change if volume might, where the
-    data do not decide on it.
+    `samples` (n, 3, s) are random coefficients about c. Soft cells whose content is not in both volumes are not answered. `misfit` (m, 3)
+    is that of `CorrelationFit.cell_misfit` at full resolution, and `loose` (n, 3), mm, how the coefficients would change if volume might,
+    where the data do not decide on it.
 
     Notes
     -----
@@ -302,7 +303,7 @@ def collected(
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
     valid = np.zeros(volume.shape, dtype=bool)
     inside = level.mask.copy()
-    answered = matched[fit.cell_of_voxel]
+    answered = (content.matched & ~content.unlike)[fit.cell_of_voxel]
     for inclusion in fit.inclusions:
         answered[inclusion.voxels] = True
     inside[level.mask] = answered & level.shows(level.index * level.spacing + fit.displacement)
@@ -325,7 +326,7 @@ def collected(
     # which is the size of an error in an unknown direction, a third of whose square lies along every axis
     bias = *biases(fit, c, bending, dilatation), loose / np.float32(np.sqrt(3.0))
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
-    misplaced = misplacement_variance(fit, misfit)
+    misplaced = misplacement_variance(fit, misfit, content.unlike)
     biased = bias_variance(fit, bias)
     variance = biased + remaining + misplaced
     spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
