@@ -228,7 +228,7 @@ def test_steps_go_on_as_long_as_cells_move(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_little_agreement_counts_as_no_match_where_the_residual_is_no_noise() -> None:
-    content = CommonContent(np.array([0.2, 0.5, 0.5, 0.7]), np.array([0.0, 0.0, 0.3, 0.3]))
+    content = CommonContent(np.array([0.2, 0.5, 0.5, 0.7]), np.array([0.0, 0.0, 0.3, 0.3]), np.zeros(4, dtype=bool))
     assert content.matched.tolist() == [False, True, False, True]
 
 

@@ -209,9 +209,11 @@ def calibrate_lattice(
     prior_sd : float
         Standard deviation of the logarithms around the start, so that what the data do not determine stays there.
     max_iterations : int
-        Of the coarse iterations with one size of the noise.
+        Of the coarse iterations with one size of the noise; in contact of the steps of `SecantSearch`, after which regressions
+        have a limit of their own.
     reweigh : bool
-        Whether the noise is enlarged to the misfit.
+        Whether the noise is enlarged to the misfit. Not regarded in contact, where regressions always weigh residuals by noise
+        and errors of the model.
     warm_start : array_like or mapping, optional
         Values from which the search begins, as the estimate of a similar problem; weak priors stay around `start`. By default `start`.
     widen : bool
@@ -230,7 +232,7 @@ def calibrate_lattice(
     InputError
         A start that is not positive.
     ConvergenceError
-        The iterations did not settle.
+        The iterations did not settle. In contact the estimate says so instead (`LatticeEstimate.settled`).
     KeyboardInterrupt
         An interruption before the first evaluation has ended.
     """

@@ -129,7 +129,7 @@ class LatticeEngine:
 
     def rest(self) -> LatticeState:
         """Return the lattice at rest, without any force."""
-        return LatticeState(self.lattice.points.copy(), np.zeros_like(self.lattice.points), np.zeros(self.lattice.n_elements))
+        return LatticeState.at_rest(self.lattice)
 
     def session(
         self,

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
@@ -29,7 +28,7 @@ class WarpLatticeEngine(PreparedLattice):
 
     def rest(self) -> LatticeState:
         """Return the lattice at rest, without any force."""
-        return LatticeState(self.lattice.points.copy(), np.zeros_like(self.lattice.points), np.zeros(self.lattice.n_elements))
+        return LatticeState.at_rest(self.lattice)
 
     def session(
         self,

@@ -44,6 +44,11 @@ class LatticeState:
     length: FloatArray | None = None
     contact: ContactState | None = None
 
+    @classmethod
+    def at_rest(cls, lattice: Lattice) -> LatticeState:
+        """Return a lattice at rest, without any force."""
+        return cls(lattice.points.copy(), np.zeros_like(lattice.points), np.zeros(lattice.n_elements))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConstrainedNodes:

@@ -241,7 +241,7 @@ def begin_study(study: LatticeStudy) -> StudyState:
     """
     check_study(study)
     indenters = [body.indenter for body in study.bodies]
-    state = LatticeState(study.lattice.points.copy(), np.zeros_like(study.lattice.points), np.zeros(study.lattice.n_elements))
+    state = LatticeState.at_rest(study.lattice)
     if not study.tied:
         state = replace(state, contact=begin_contact(study.lattice, ContactSurface.of(study.lattice, study.parameters), indenters))
     positions = np.array([p.centre for p in indenters], dtype=float).reshape(-1, 3)
