@@ -6,7 +6,7 @@ Frames have the budget of `naibu live`: a step that takes longer goes on in the 
 `static` compares the rest under the tool with the offline solution of `QuasiStaticSession`.
 
 Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [--tool plate] [--speed 24] [--repeatable]
-[--static | --cut | --drag | --rub]``; a number N is a box of 6 N^3 tetrahedra, nu 0.499.
+[--static | --cut | --drag [--lips-friction 0.4] | --rub]``; a number N is a box of 6 N^3 tetrahedra, nu 0.499.
 """
 
 from __future__ import annotations
@@ -176,13 +176,13 @@ def cut(body: FiniteElementBody) -> None:
     simulation.close()
 
 
-def dragged(body: FiniteElementBody) -> None:
+def dragged(body: FiniteElementBody, lips_friction: float) -> None:
     """Cut a body half through from above, drag a sphere 7 mm across the cut and back, twice, at several places, and print the frames.
 
     Tangents are renewed at fixed steps, so that only the times differ from run to run.
     """
     radius, (low, high) = 8.0, (body.points.min(axis=0), body.points.max(axis=0))
-    middle, still = 0.5 * (low + high), replace(body, engine=replace(body.engine, background=False))
+    middle, still = 0.5 * (low + high), replace(body, engine=replace(body.engine, background=False), lips_friction=lips_friction)
     for friction, offset in ((0.3, 0.0), (1.0, 0.0), (0.3, 2.0), (0.2, 1.0)):
         x = middle[0] + offset
         at = np.array([middle[0] - 3.5, middle[1], high[2] + radius + 3.0])
@@ -190,18 +190,21 @@ def dragged(body: FiniteElementBody) -> None:
         simulation = InteractiveSimulation(still, {"sphere": sphere})
         simulation.cut([[[x, y, high[2] + 5.0], [x, y, middle[2]]] for y in (low[1] - 5.0, high[1] + 5.0)])
         simulation.take("sphere")
-        ms, failed = [], 0
+        ms, left, failed = [], [], 0
         for way in [(0.0, -9.0), *2 * [(7.0, 0.0), (-7.0, 0.0)], (0.0, 9.0)]:
             for _ in range(9):  # some 50 mm/s
                 at = at + np.array([way[0], 0.0, way[1]]) / 9
                 simulation.move(at)
                 processor = time.thread_time()
-                failed += bool(simulation.advance().failed)
+                frame = simulation.advance()
+                failed += bool(frame.failed)
+                left.append(100.0 * frame.unbalanced)
                 ms.append(1e3 * (time.thread_time() - processor))
         median, most, high_ms = np.median(ms), max(ms), np.quantile(ms, 0.9)
         print(
             f"friction {friction:g}, {offset:g} mm beside the cut, {len(simulation.body.cells)} cells: processor ms a frame: "
-            f"median {median:.1f}, p90 {high_ms:.1f}, worst {most:.1f}; failed {failed} of {len(ms)}",
+            f"median {median:.1f}, p90 {high_ms:.1f}, worst {most:.1f}; "
+            f"out of balance {np.median(left):.1f} %, at most {max(left):.0f} %; failed {failed} of {len(ms)}",
             flush=True,
         )
         simulation.close()
@@ -273,6 +276,7 @@ def main() -> None:
     parser.add_argument("--static", action="store_true")
     parser.add_argument("--cut", action="store_true", help="only time a cut")
     parser.add_argument("--drag", action="store_true", help="only drag a sphere across a cut and back")
+    parser.add_argument("--lips-friction", type=float, default=0.0, help="between the sides of the cut that a sphere is dragged across")
     parser.add_argument("--rub", action="store_true", help="only cut through with friction, and shear")
     parser.add_argument("--repeatable", action="store_true", help="tangents at fixed steps, whose time is left out")
     given = parser.parse_args()
@@ -282,7 +286,7 @@ def main() -> None:
         cut(body)
         return
     if given.drag:
-        dragged(body)
+        dragged(body, given.lips_friction)
         return
     if given.rub:
         rubbed(body)

@@ -67,6 +67,23 @@ def test_a_cut_block_under_compression_is_as_stiff_as_the_whole_one(tilt, within
     assert -gaps.mean() == pytest.approx(mean / assembler.lips.stiffness.mean(), rel=0.5)
 
 
+def test_every_node_that_a_cut_doubled_is_in_one_pair_whatever_the_order_of_the_triangles():
+    """Which of two triangles that lie on each other comes first is a matter of their numbers: pressure and friction acted in two halves."""
+    _, cut = cut_block(0.47 * SIZE, tilt=1.0, n=5)
+    at, copies = np.unique(cut.points, axis=0, return_counts=True)
+    faces = boundary_faces(cut).faces
+    u = np.where((cut.points[:, 2] > 0.5 * SIZE)[:, None], np.array([0.1, 0.0, -0.01]), 0.0)
+    found = []
+    for order in (np.arange(len(faces)), np.random.default_rng(1).permutation(len(faces))):
+        lips = cut_lips(cut.points, faces[order], np.full(cut.n_points, 1.0))
+        assert len(lips.pairs) == np.count_nonzero(copies == 2) and copies.max() == 2 < len(at)
+        assert (np.bincount(lips.pairs.ravel()) <= 1).all()
+        force = np.zeros_like(u)
+        found.append((lips.with_friction(0.3).add(u, force)[0], force, lips.area.sum()))
+    assert found[0][0] == pytest.approx(found[1][0], rel=1e-12) and found[0][2] == pytest.approx(found[1][2], rel=1e-12)
+    np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-12 * np.abs(found[0][1]).max())
+
+
 def test_a_cut_block_under_tension_opens_as_without_contact():
     _, cut = cut_block(0.5 * SIZE, through=False)
     assembler, u, force = pressed(cut, 1.0)

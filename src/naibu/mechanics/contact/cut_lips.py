@@ -34,9 +34,9 @@ class CutLips:
     points : ndarray, shape (n, 3)
         Nodes at rest, mm.
     faces : ndarray, shape (2 f, 3), int64
-        Triangles of the first sides, then in the same order those of the second.
+        Triangles of one side of every pair of them, then in the same order those of the other.
     pairs : ndarray, shape (p, 2), int64
-        Nodes on the first and on the second side.
+        Nodes on the first and on the second side; no two pairs have the same nodes.
     corner_pair : ndarray, shape (2 f, 3), int64
         Pair that every corner of the triangles belongs to; -1 at the front of a cut, where both sides have one node.
     area : ndarray, shape (p,)
@@ -154,7 +154,9 @@ class CutLips:
         tangential = TANGENTIAL * self.stiffness * self.area
         shift = relative - anchors
         return float(
-            _slipped(pressing, slope, normal, self.pairs, shift, tangential, self.friction, secant, force, blocks, traction)
+            _slipped(
+                pressing, slope, normal, self.pairs, shift, tangential, self.friction, secant, not secant, force, blocks, traction
+            )
         )  # fmt: skip
 
     def _relative(self, displacement: FloatArray) -> FloatArray:
@@ -192,7 +194,7 @@ def cut_lips(points: FloatArray, faces: IntArray, shear_modulus: FloatArray) -> 
         return None
     both = np.stack([sorted_faces[first], sorted_faces[second]], axis=2).reshape(-1, 2)  # corners of each triangle and of its twin
     apart = both[:, 0] != both[:, 1]
-    pairs, number = np.unique(both[apart], axis=0, return_inverse=True)
+    pairs, number = np.unique(np.sort(both[apart], axis=1), axis=0, return_inverse=True)  # which triangle comes first depends on its number
     corner = np.full(len(both), -1, dtype=np.int64)
     corner[apart] = number.ravel()
     corners = points[sorted_faces[first]]
@@ -210,10 +212,8 @@ def cut_lips(points: FloatArray, faces: IntArray, shear_modulus: FloatArray) -> 
 def _state(points, faces, pairs, corner_pair, edge, u):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Gaps (p,) and unit normals (p, 3), from the first side to the second, of all pairs."""
     sides = np.zeros((2, len(pairs), 3))
-    half = len(faces) // 2
     e, f = np.empty(3), np.empty(3)
     for t in range(len(faces)):
-        side = 0 if t < half else 1
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
         for i in range(3):
             e[i] = points[b, i] + u[b, i] - points[a, i] - u[a, i]
@@ -221,6 +221,7 @@ def _state(points, faces, pairs, corner_pair, edge, u):  # type: ignore[no-untyp
         for k in range(3):
             p = corner_pair[t, k]
             if p >= 0:
+                side = 0 if faces[t, k] == pairs[p, 0] else 1
                 for i in range(3):
                     j, m = (i + 1) % 3, (i + 2) % 3
                     sides[side, p, i] += e[j] * f[m] - e[m] * f[j]
@@ -270,8 +271,10 @@ def _pressed(gap, normal, pairs, area, edge, stiffness, force, blocks):  # type:
 
 @njit(cache=True, nogil=True)
 def pair_forces(relative, anchors, normals, area, edge, stiffness, mu, force, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set the internal forces (p, 3) of pairs on their first nodes and their stiffnesses (p, 3, 3), with the secant of friction.
+    """Set the internal forces (p, 3) of pairs on their first nodes and their stiffnesses (p, 3, 3).
 
+    That of friction is its secant along the slip and its growth with the pressure. Without this growth, iterations diverge where many pairs
+    slide whose normals differ, as on the facets of an oblique cut: approach of one side changes the force along the other.
     It is what `CutLips.add` finds of pairs that have been given normals, from the positions of the second nodes relative to the first
     (p, 3), mm, without arrays in between: it is called many times in a step.
     """
@@ -295,7 +298,7 @@ def pair_forces(relative, anchors, normals, area, edge, stiffness, mu, force, bl
         slope[p] = -g / ramp * k if g > -ramp else k
     _pressed(gap, normals, own, area, edge, stiffness, both, blocks)
     if mu > 0.0:
-        _slipped(pressing, slope, normals, own, shift, tangential, mu, True, both, blocks, np.zeros((count, 3)))
+        _slipped(pressing, slope, normals, own, shift, tangential, mu, True, True, both, blocks, np.zeros((count, 3)))
     for p in range(count):
         for i in range(3):
             force[p, i] = both[2 * p, i]
@@ -310,9 +313,13 @@ def _across(gap: FloatArray, area: FloatArray, edge: FloatArray, stiffness: Floa
 
 @njit(cache=True, nogil=True)
 def _slipped(  # type: ignore[no-untyped-def]  # pragma: no cover
-    pressing, slope, normal, pairs, shift, tangential, mu, secant, force, blocks, traction
+    pressing, slope, normal, pairs, shift, tangential, mu, secant, growing, force, blocks, traction
 ):
-    """Add the friction of closed pairs and its derivative, which is unsymmetric where they slide; returns the energy of elastic slip."""
+    """Add the friction of closed pairs and its stiffness; returns the energy of elastic slip.
+
+    The stiffness is the derivative, or the secant along the slip; with or without the growth of friction with pressure, which is
+    unsymmetric.
+    """
     energy = 0.0
     e = np.empty(3)
     for p in range(len(pairs)):
@@ -335,10 +342,10 @@ def _slipped(  # type: ignore[no-untyped-def]  # pragma: no cover
             force[pairs[p, 0], i] -= ratio * e[i]
             force[pairs[p, 1], i] += ratio * e[i]
             for j in range(3):
-                held = tangential[p] * ((1.0 if i == j else 0.0) - normal[p, i] * normal[p, j])
-                if slides and secant:
-                    held *= ratio
-                elif slides:
-                    held = ratio * (held - tangential[p] * e[i] * e[j] / size**2) - mu * slope[p] * e[i] * normal[p, j] / size
+                held = ratio * tangential[p] * ((1.0 if i == j else 0.0) - normal[p, i] * normal[p, j])
+                if slides and not secant:
+                    held -= ratio * tangential[p] * e[i] * e[j] / size**2
+                if slides and growing:
+                    held -= mu * slope[p] * e[i] * normal[p, j] / size
                 blocks[p, i, j] += held
     return energy

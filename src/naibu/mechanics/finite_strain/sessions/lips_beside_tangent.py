@@ -2,8 +2,9 @@
 
 A tangent of then holds closed what was closed then. Pairs whose state has changed since, or may change, are taken out of it, and their
 contact is solved as it is, condensed to their nodes like that of indenters (`naibu.mechanics.finite_strain.sessions.condensed_contact`).
-Friction has the stiffness of its secant in both, which is symmetric. Where it acts, all pairs that press or are near to it are taken out:
-what the others leave out of balance where the motion turns round takes iterations of the whole body, and at last Newton's method.
+Friction has the stiffness of its secant in both; in the tangent, which is symmetric, without its growth with pressure. Where it acts, all
+pairs that press or are near to it are taken out: what the others leave out of balance where the motion turns round takes iterations of the
+whole body, and at last Newton's method.
 """
 
 from __future__ import annotations

@@ -46,8 +46,19 @@ class TangentSession(DynamicSession):
     _until: float = field(init=False, default=np.inf)  # processor time at which a step is left to the next call
 
     def keep_tangent(self) -> None:
-        """Have the tangent of the state reached at hand for the next sessions of the engine, in place of that of the body at rest."""
-        self._engine._rest[:] = [self._untouched(self.reached.displacement)]
+        """Have the tangent of the state reached at hand for the next sessions of the engine, in place of that of the body at rest.
+
+        It contains the contacts with indenters that touch in this state, such as the table on which the body lies: without them a body that
+        nothing else holds is free to move, and the first steps would have to find its whole support by iterations of the contact.
+        """
+        u = self.reached.displacement
+        contacts = self._still()
+        near = [NearbyContact.of(c, a, np.zeros(len(c.nodes)), np.inf) for c, a in zip(contacts, self.reached.anchors, strict=True)]
+        for some in near:
+            some.add_force(u, np.zeros_like(u))
+        touching = tuple(some.touching() for some in near)
+        ahead = self._soon_touched(contacts, [some.gap for some in near])
+        self._engine._rest[:] = [self._made(u, touching, self._places, self._held(), ahead, self._slipped)]
 
     def close(self) -> None:
         """End the thread and release the factors."""
@@ -74,16 +85,20 @@ class TangentSession(DynamicSession):
         at = self.reached
         known = self._kept.nearest(at.displacement + self.engine.step * at.velocity, self._held(), self.engine._extent, self._engine._rest)
         if known is None:
-            self._engine._rest[:] = [self._untouched(np.zeros_like(self.engine.points))]
+            self._engine._rest[:] = [self._untouched()]
             known, self._seen = self._engine._rest[0], np.zeros_like(self.engine.points)
         return self._used(known)
 
-    def _untouched(self, u: FloatArray) -> EarlierTangent:
-        """Return the tangent at a displacement without contacts of indenters."""
-        still = np.zeros((len(self._templates), 3))
-        contacts = self._contacts(0.0, still, still)  # where indenters are now
+    def _untouched(self) -> EarlierTangent:
+        """Return the tangent of the body at rest without contacts of indenters."""
+        contacts = self._still()
         gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in contacts]
-        return self._made(u, (), (), self._held(), self._soon_touched(contacts, gaps), self._slipped if u.any() else None)
+        return self._made(np.zeros_like(self.engine.points), (), (), self._held(), self._soon_touched(contacts, gaps), None)
+
+    def _still(self) -> tuple[Contact, ...]:
+        """Contacts of indenters where they are now."""
+        still = np.zeros((len(self._templates), 3))
+        return self._contacts(0.0, still, still)
 
     def _renew(self, ahead: IntArray) -> None:
         """Have a tangent made of the state reached, if anything has changed since the last one."""
