@@ -197,7 +197,8 @@ def identified_on_smaller_cubes(
 def still_thin(cubes: ObjectOnCubes, smaller: ObjectOnCubes, sought: Collection[str]) -> tuple[str, ...]:
     """Return zones that are one cube thick on smaller cubes, if none of those that are sought ceased to be.
 
-    Intervals reckon with such zones whatever the size of cubes, and become no narrower: virtual legs took several times as long for that.
+    Intervals reckon with such zones whatever the size of cubes, and become hardly narrower: on a virtual leg that of the muscle went from a
+    factor of 2.3 to one of 2.0, in five times the time.
     """
     before, after = (() if on.region_at is None else one_cell_thick(on.mesh) for on in (cubes, smaller))
     return () if set(sought) & (set(before) - set(after)) else after
