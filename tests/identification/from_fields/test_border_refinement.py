@@ -159,7 +159,11 @@ def test_corrections_for_the_size_of_cells_find_what_smaller_cells_made() -> Non
     found = refined_borders(again, zones, replace(_homogeneous(fields), theta=theta), Bounds())
     corrected = on_finer_cells(again, "linear", found, Bounds())
     assert corrected is not None
-    assert corrected.converged
+    assert corrected.converged and corrected.of_law
+    whole, sd = np.abs(corrected.shift).max(), [np.sqrt(np.diag(replace(corrected, of_law=law).doubt)) for law in (True, False)]
+    np.testing.assert_allclose(sd[1], whole)  # of small strain
+    assert (sd[0][:2] < 0.5 * whole).all()
+    assert (sd[0][2:] > 0.85 * whole).all()  # a ratio of bulk to shear modulus of a liver was off by .17, where .08 was stated
     off, left = (abs(np.log(young_and_poisson(t)[0][1] / truth[1])) for t in (found.theta, corrected.refined.theta))
     assert left < 0.5 * off
 

@@ -74,6 +74,8 @@ def test_a_zone_is_identified_on_the_grid_of_the_scan(folder: Path) -> None:
     page = (folder / "out" / "report.html").read_text()
     assert "Young&#x27;s modulus" in page and "Moduli under other assumptions" in page
     assert check_shown(run, folder / "out" / "report.html") == numbers["zones"]
+    determined = numbers["zones"][0]["Young's modulus is"]
+    assert f", {determined}</span>" in page  # with the number at the top, too
 
 
 def test_what_nothing_determines_is_null_in_the_file_of_numbers(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -240,13 +240,23 @@ def test_cubes_stay_where_they_limit_nothing_or_can_hardly_be_smaller() -> None:
     assert smaller_size(SIDE_MM**3, cubes.mesh, 150) is None
 
 
+def test_cubes_stay_where_a_thin_zone_stays_one_cube_thick() -> None:
+    """The skin, of 2 to 6 mm, is one cube of 6.7 mm thick as it is one of 8 mm, but not of 5 mm (above)."""
+    cubes = scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False)
+    found, same, kept, told = identified_again(cubes, 210)
+    assert found.limited_by_mesh and "skin" in one_cell_thick(cubes.mesh)
+    assert same is cubes and kept is found
+    (told_so,) = told
+    assert "but " in told_so and "skin would be one cube thick of 6.7 mm as well" in told_so
+
+
 def test_larger_cubes_stand_where_smaller_ones_find_no_equilibrium(monkeypatch: pytest.MonkeyPatch) -> None:
     def without_equilibrium(*_: object, **__: object) -> FieldEstimate:
         raise ConvergenceError("a cell is inverted")
 
     cubes, told = scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False), list[str]()
     monkeypatch.setattr(ObjectOnCubes, "identified", without_equilibrium)
-    found = Mock(spec=FieldEstimate, limited_by_mesh=True)
+    found = Mock(spec=FieldEstimate, limited_by_mesh=True, zones=Mock(names=("core", "skin")))
     stated, bounds = parse_known_zones(["pad=10 kPa, 0.45"], list(NAMES.values())), Bounds()
     same, kept = identified_on_smaller_cubes(
         cubes, found, stated, most=520, law="neo_hookean", bounds=bounds, progress=lambda report: told.append(report.stage)

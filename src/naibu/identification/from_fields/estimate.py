@@ -359,10 +359,10 @@ class _Recipe:
         quadratic = at.concentrated(np.eye(2 * model.zones.count))
         shift: FloatArray | None
         if corrected is not None:
-            theta, residuals, shift = corrected.refined.theta, corrected.residuals, corrected.shift
+            theta, residuals, shift, alike = corrected.refined.theta, corrected.residuals, corrected.shift, True
             stretch = np.ones_like(theta)
         else:
-            theta, residuals, shift = self._extrapolated(at, quadratic)
+            theta, residuals, shift, alike = self._extrapolated(at, quadratic)
             stretch = stretch_of(np.zeros_like(theta) if shift is None else shift)
             if refined is not None:
                 theta = Objective(bounds=self.bounds).clipped(theta + refined.theta - point.theta)
@@ -385,7 +385,7 @@ class _Recipe:
             sure = on_mesh.standard_deviations() < DETERMINED
             if corrected is None:
                 layers, apart = np.isin(names, thin) if thin else None, np.isin(names, judged.mesh_dependent)
-                change, mixed = relative_change(shift), self.region_at is not None
+                change, mixed = relative_change(shift), self.region_at is not None or not alike
                 covariance = doubt_in_all(change, sure, quadratic.hessian, apart, mixed=mixed, thin=layers)
                 coarse = bool(thin) or float(np.abs(change[sure]).max(initial=0.0)) > COARSE
             else:
@@ -416,8 +416,11 @@ class _Recipe:
         doubt[of_shear] = high[of_shear] - low[of_shear]
         return doubt
 
-    def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None]:
-        """Return theta and whitened residuals at vanishing element size, and the change of theta; None where it was not estimated."""
+    def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None, bool]:
+        """Return theta and whitened residuals at vanishing element size, and the change of theta; None where it was not estimated.
+
+        Also whether that change is one under the law of the identification.
+        """
         fitted, model, where = at.point.theta, at.model, self.region_at
 
         def moduli_on(mesh: Mesh, zones: Zones) -> tuple[FloatArray, FloatArray]:
@@ -425,12 +428,12 @@ class _Recipe:
 
         changes = changes_on_finer_mesh(at, self.law, moduli_on) if self.elements == "accurate" else None
         if changes is None:
-            return fitted, tuple(o.residual(u) for o, u in zip(model.observed, at.point.states, strict=True)), None
+            return fitted, tuple(o.residual(u) for o, u in zip(model.observed, at.point.states, strict=True)), None, True
         if changes[1] != self.law:
-            self.record("elements of half the size are inverted at finite strain: what they change is taken from small strain")
+            self.record("elements of half the size find no equilibrium at finite strain: what they change is taken from small strain")
         finer = refitted(at, quadratic, changes[0])
         theta = Objective(bounds=self.bounds).clipped(extrapolated(fitted, finer.theta))
         young, before = young_and_poisson(theta)[0], young_and_poisson(fitted)[0]
         most = 100.0 * float(np.abs(young / before - 1.0).max())
         self.record(f"half the element size: Young's modulus changes by up to {most:.2g} % when extrapolated to vanishing size")
-        return theta, finer.residuals, theta - fitted
+        return theta, finer.residuals, theta - fitted, changes[1] == self.law

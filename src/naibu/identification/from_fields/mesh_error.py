@@ -111,10 +111,10 @@ def doubt_of(
 
     Those of ln(kappa / mu) are relative to mu / kappa on the mesh (see `relative_change` and `stretch_of`).
     The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left. Where zones
-    end inside of cells (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size. If regions
-    are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than `ITSELF` times as
-    much. Logarithms that the measurement does not determine move at no cost to the fit, and tell nothing of others: only those that are
-    `sure` (2 count,) count as the worst, and each gets at least the doubt of its own change.
+    end inside of cells, or the change is that of another law (`mixed`), it has no order of convergence: what is left may be as large as the
+    change to half the size. If regions are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that
+    are, for less than `ITSELF` times as much. Logarithms that the measurement does not determine move at no cost to the fit, and tell
+    nothing of others: only those that are `sure` (2 count,) count as the worst, and each gets at least the doubt of its own change.
     """
     told = np.abs(shift) if sure is None else np.abs(shift[sure])
     worst = max(float(told.max(initial=0.0)), 0.0 if thin is None else THIN)
@@ -186,8 +186,9 @@ def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> 
     """Return by how much the whitened residuals (q,) of every load case change on a mesh of half the element size, and under which law.
 
     `moduli_on` gives the moduli of its cells, which are not those of the coarse ones where borders run through these.
-    Where no equilibrium at finite strain is found on it, because the displacement of the loaded nodes is too rough for small cells, the
-    change is that of small strain. None where the elements are used as given, or the finer mesh is too large.
+    Where no equilibrium at finite strain is found on it, because the displacement of the loaded nodes is too rough for small cells or the
+    path there from rest too long, the change is that of small strain. Its error for shear moduli of virtual legs was as large as itself.
+    None where the elements are used as given, or the finer mesh is too large.
     """
     model = at.model
     if not model.averaged or 8 * model.points.size > MOST_UNKNOWNS:

@@ -313,13 +313,15 @@ def table_of_assumptions(result: FieldIdentification) -> Table:
 
 
 def _cards(result: FieldIdentification) -> list[Card]:
-    """Return Young's modulus of the first zones with its interval."""
+    """Return Young's modulus of the first zones with its interval, and how well it is determined."""
     found = result.estimate
     if found.uncertainty is None:
         return []
-    rows = zip(found.zones.names[:MOST_CARDS], found.young_modulus, found.intervals()[0], strict=False)
+    how = _grades(found, found.uncertainty)
+    rows = zip(found.zones.names[:MOST_CARDS], found.young_modulus, found.intervals()[0], how, strict=False)
     return [
-        Card(f"Young's modulus, {name}", f"{e:.3g} {result.unit}", f"95 % from {low:.3g} to {high:.3g}") for name, e, (low, high) in rows
+        Card(f"Young's modulus, {name}", f"{e:.3g} {result.unit}", f"95 % from {low:.3g} to {high:.3g}, {word}")
+        for name, e, (low, high), word in rows
     ]
 
 

@@ -20,6 +20,7 @@ from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Z
 from naibu.identification.from_fields.forward.representation_error import with_noise_of_neighbours, with_representation_error
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.gauss_newton import Bounds
+from naibu.identification.from_fields.mesh_error import one_cell_thick
 from naibu.workflows.fields.block_mesh import BLURRED, mesh_that_shows, misplaced, moved_borders, region_in, regions_of
 from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.known_zones import KnownZones
@@ -160,7 +161,7 @@ def identified_on_smaller_cubes(
     bounds: Bounds,
     progress: Progress | None,
 ) -> tuple[ObjectOnCubes, FieldEstimate]:
-    """Return the object on smaller cubes and its moduli there, where the size of cubes limits what is known; else what is given.
+    """Return the object on smaller cubes and its moduli there, where their size limits what is known and half of it helps; else the given.
 
     Parameters
     ----------
@@ -177,14 +178,30 @@ def identified_on_smaller_cubes(
     size = smaller_size(scanned.volume_mm3, cubes.mesh, most) if found.limited_by_mesh else None
     if size is None:
         return cubes, found
-    report_progress(progress, f"the size of cubes limits what is known of moduli: again with cubes of {size:.2g} mm")
     smaller = scanned.on_cubes(size, (), exactly=True, each_cell=False)
+    if thin := still_thin(cubes, smaller, found.zones.names):
+        report_progress(
+            progress,
+            f"the size of cubes limits what is known of moduli, but {', '.join(thin)} would be one cube thick of {size:.2g} mm as well",
+        )
+        return cubes, found
+    report_progress(progress, f"the size of cubes limits what is known of moduli: again with cubes of {size:.2g} mm")
     try:
         again = smaller.identified(stated, law=law, bounds=bounds, each_cell=False, progress=progress, coarser=found)
     except ConvergenceError as error:
         report_progress(progress, f"smaller cubes lead nowhere, and moduli are those on the larger ones: {error}")
         return cubes, found
     return smaller, again
+
+
+def still_thin(cubes: ObjectOnCubes, smaller: ObjectOnCubes, sought: Collection[str]) -> tuple[str, ...]:
+    """Return zones that are one cube thick on smaller cubes, if none of those that are sought ceased to be.
+
+    Intervals reckon with such zones whatever the size of cubes, and become hardly narrower: on a virtual leg that of the muscle went from a
+    factor of 2.3 to one of 2.0, in five times the time.
+    """
+    before, after = (() if on.region_at is None else one_cell_thick(on.mesh) for on in (cubes, smaller))
+    return () if set(sought) & (set(before) - set(after)) else after
 
 
 def _start(found: FieldEstimate) -> tuple[FloatArray, FloatArray]:

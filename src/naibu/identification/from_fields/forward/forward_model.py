@@ -32,6 +32,8 @@ EXACT = 1e-3  # standard deviation ascribed to data that are called exact, as a 
 SURFACE_STRAIN = 0.2  # standard deviation of the strain along loaded nodes: constrains those near which nothing was measured
 NEWTON_TOLERANCE = 1e-9  # residual force over the force on the loaded nodes
 NEWTON_ITERATIONS = 12
+PATIENT_ITERATIONS = 30  # from a displacement that larger cells lend
+LONG_WAY = 30_000  # unknowns up to which equilibrium is sought from rest as well: twenty factorizations or more, minutes beyond
 HALVINGS = 6
 ITERATIVE_FROM = 30_000  # unknowns from which a body solved only once or twice is solved by iteration
 
@@ -190,7 +192,14 @@ class Solvers:
 
 
 def equilibrium(
-    law: FieldLaw, solvers: Solvers, lame: FloatArray, shear: FloatArray, load_case: FieldLoadCase, guess: FloatArray, owner: bytes
+    law: FieldLaw,
+    solvers: Solvers,
+    lame: FloatArray,
+    shear: FloatArray,
+    load_case: FieldLoadCase,
+    guess: FloatArray,
+    owner: bytes,
+    iterations: int = NEWTON_ITERATIONS,
 ) -> tuple[FloatArray, Factorization]:
     """Return the displacement (n, d), mm, in equilibrium, with the loaded components as in `guess`, and the factorized tangent there.
 
@@ -202,7 +211,7 @@ def equilibrium(
     u, constrained = guess, load_case.loaded
     factor, before = solvers.factorized(lame, shear, u, constrained, owner), np.inf
     force = law.forces(lame, shear, u)
-    for _ in range(NEWTON_ITERATIONS):
+    for _ in range(iterations):
         residual = force - load_case.external_force
         scale = float(np.abs(residual[constrained]).sum() + np.abs(load_case.external_force).sum())
         if not np.isfinite(scale):
@@ -218,7 +227,7 @@ def equilibrium(
         if law.linear:
             return u - step, factor
         u, force = _stepped(law, lame, shear, u, step)
-    raise ConvergenceError(f"load case {load_case.name!r}: Newton's method did not reach equilibrium within {NEWTON_ITERATIONS} iterations")
+    raise ConvergenceError(f"load case {load_case.name!r}: Newton's method did not reach equilibrium within {iterations} iterations")
 
 
 def _stepped(law: FieldLaw, lame: FloatArray, shear: FloatArray, u: FloatArray, step: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -236,16 +245,20 @@ def settled(
 ) -> FloatArray:
     """Return the displacement (n, d), mm, in equilibrium, with the loaded components as in `guess`, sought from there, then from rest.
 
-    A displacement that larger cells lend to small ones is rough at borders of stiff zones, beyond what Newton's method overcomes.
+    A displacement that larger cells lend to small ones is rough at borders of stiff zones and at a surface near incompressibility. Newton's
+    method overcomes that slowly or not at all. The path of the load from rest is then followed in bodies of up to `LONG_WAY` unknowns; in
+    larger ones it took longer than all of an identification.
 
     Raises
     ------
     ConvergenceError
-        Newton's method fails from this guess, and the path of the load from rest ends early.
+        Newton's method fails from this guess, and the body is too large for the path from rest, or that ends early.
     """
     try:
-        return equilibrium(law, solvers, lame, shear, load_case, guess, b"")[0]
+        return equilibrium(law, solvers, lame, shear, load_case, guess, b"", PATIENT_ITERATIONS)[0]
     except ConvergenceError:
+        if points.size > LONG_WAY:
+            raise
         start = loaded_from_rest(law, points, lame, shear, load_case, guess)
         return equilibrium(law, solvers, lame, shear, load_case, np.where(load_case.loaded, guess, start), b"")[0]
 

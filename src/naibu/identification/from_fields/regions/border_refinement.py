@@ -24,7 +24,7 @@ from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
 from naibu.identification.from_fields.gauss_newton import Bounds, Objective
-from naibu.identification.from_fields.mesh_error import DOUBT, changes_on_finer_mesh, refitted
+from naibu.identification.from_fields.mesh_error import DOUBT, DOUBT_OF_RATIO, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
 from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined
 from naibu.identification.from_fields.regularization import ZoneGraph, cell_volumes
@@ -185,20 +185,25 @@ class CorrectedRegions:
         By how much the small cells changed the logarithms of the moduli.
     converged : bool
         Whether the last correction changed them by next to nothing.
+    of_law : bool
+        Whether the small cells had the law of the identification each time, rather than small strain.
     """
 
     refined: RefinedRegions
     residuals: tuple[FloatArray, ...]
     shift: FloatArray
     converged: bool
+    of_law: bool
 
     @property
     def doubt(self) -> FloatArray:
         """Covariance (2 regions, 2 regions) of what still smaller cells would change.
 
-        Regions share their borders: none is surer than the one that changed most.
+        Regions share their borders: none is surer than the one that changed most. The ratio of bulk to shear modulus feels flat faces of a
+        curved body as it does without a correction. What small strain changed is doubted whole.
         """
-        return np.diag(np.full_like(self.shift, DOUBT * float(np.abs(self.shift).max(initial=0.0))) ** 2)
+        parts = (DOUBT, DOUBT_OF_RATIO) if self.of_law else (1.0, 1.0)
+        return np.diag((np.repeat(parts, len(self.shift) // 2) * float(np.abs(self.shift).max(initial=0.0))) ** 2)
 
 
 def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bounds: Bounds) -> CorrectedRegions | None:
@@ -213,13 +218,13 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     """
     mixing, n, edge = found.mixing, len(found.theta), found.mixing.borders.edge_mm
     here, now, objective = _Trial(found.theta, found.borders.moves.ravel(), found.point, found.objective), found, Objective(bounds=bounds)
-    residuals, converged, before, least = tuple[FloatArray, ...](), False, here, np.inf
+    residuals, converged, before, least, of_law = tuple[FloatArray, ...](), False, here, np.inf, True
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
         finer = changes_on_finer_mesh(at, law, now.moduli_on)
         if finer is None:
             return None
-        changes, _ = finer
+        changes, of_law = finer[0], of_law and finer[1] == law
         left = sum(float(np.sum((o.residual(u) + c) ** 2)) for o, u, c in zip(model.observed, at.point.states, changes, strict=True))
         if left > least:  # surfaces that follow precise data move differently among smaller cells: no more can be said
             here = before
@@ -240,7 +245,7 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
         converged = bool((np.abs(fit.theta[:n]) < np.maximum(CORRECTED, WITHIN * sd)).all())
         if converged:
             break
-    return CorrectedRegions(_with_covariance(model, mixing, here), residuals, here.theta - found.theta, converged)
+    return CorrectedRegions(_with_covariance(model, mixing, here), residuals, here.theta - found.theta, converged, of_law)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
