@@ -40,6 +40,7 @@ from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
 from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, blocks_alike, displacement_of_blocks
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
+from naibu.imaging.volume_correlation.volume_changes import LATE_DRAWS
 
 # Gauss-Newton steps: the first of them with voxels of an edge in between, where there are such, and the one in which weights are adapted
 ROUGH_PASSES, ADAPTED_PASS, LEAST_PASSES, PASSES = 3, 5, 6, 8
@@ -57,8 +58,6 @@ class Model:
         Weights of the penalties.
     gain, residual_sd, jitter_voxels, reliability
         See `FieldState`; the reliability is that of the m cells.
-    lowest : ndarray, shape (m,)
-        What the weights of dilatation might have to be, where the data do not decide on volume; infinite elsewhere.
     products, pairs : ndarray, optional
         Sums of products of residuals, and their numbers, by distance.
     passes : int
@@ -74,7 +73,6 @@ class Model:
     residual_sd: float
     jitter_voxels: float
     reliability: Float32Array
-    lowest: FloatArray
     products: AnyFloatArray | None = None
     pairs: AnyFloatArray | None = None
     passes: int = 0
@@ -107,7 +105,7 @@ class SummedEquations:
         reliability = fit.reliability_of(fit.cell_agreement())
         self.model = Model(
             coarse.c, coarse.bending, coarse.dilatation, self._gain(matrix, load, fit.residual_sd, everywhere), fit.residual_sd,
-            coarse.settings.jitter_sd_voxels, reliability, coarse.lowest,
+            coarse.settings.jitter_sd_voxels, reliability,
         )  # fmt: skip
 
     def _frame(self, factor: int) -> BlockFrame:
@@ -175,7 +173,6 @@ class SummedEquations:
         sums, coarse = self._added(blocks), self.coarse
         before, passes = self.model.coefficients, self.model.passes + 1
         coarse.c, coarse.bending, coarse.dilatation = before.copy(), self.model.bending, self.model.dilatation
-        coarse.lowest = self.model.lowest
         self._settle(sums, before)
         if self.adapting and passes == ADAPTED_PASS:
             self._adapt(sums, before)
@@ -186,7 +183,7 @@ class SummedEquations:
             jitter = self.fit.bounded_jitter(float(np.sqrt(sums.jitter / sums.seen)))
         return replace(
             self._with_intensities(sums), jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending,
-            dilatation=coarse.dilatation, lowest=coarse.lowest, passes=passes,
+            dilatation=coarse.dilatation, passes=passes,
             settled=passes >= LEAST_PASSES and self.fit.moving_fraction <= UNSETTLED, products=sums.products, pairs=sums.pairs,
         )  # fmt: skip
 
@@ -207,17 +204,17 @@ class SummedEquations:
         self._settle(sums, before, 2)
         self._take_step(before)
         require_convergence(fit.moving_fraction)
-        coarse.lowest = self.model.lowest
-        loose = coarse.loosened(lambda: self._assembled(sums, before))
         self._assembled(sums, before)
         scale = lost_to_robustness(*sums.robust)
+        noise = np.ascontiguousarray(np.float32(scale) * sums.draws[:, :, :LATE_DRAWS])
+        hidden = coarse.hidden(coarse.tried(sums.matrix), self.system.solved_many(noise, SAMPLE_TOLERANCE)[0])
         samples = self._samples(np.float32(scale) * sums.draws, seed=coarse.settings.seed + 1)
         self.system.warped(coarse.c, fit.value, fit.reference_gradient, fit.gradient, fit.displacement)
         model = self._with_intensities(sums)
         fit.gain, fit.offset = self.lattice.values(model.gain)
         fit.residual_sd = model.residual_sd
         weights = coarse.bending, coarse.dilatation
-        found = collected(coarse.volume, fit, coarse.c, samples, *weights, content, sums.misfit, loose)
+        found = collected(coarse.volume, fit, coarse.c, samples, *weights, content, sums.misfit, hidden)
         return replace(found, blocks=self._small_blocks(sums.small, scale, content.unlike) if sums.small else None)
 
     def _small_blocks(self, parts: list[BlockSums], scale: float, unlike: BoolArray) -> DisplacementField:

@@ -32,7 +32,6 @@ from naibu.imaging.volume_correlation.common_content import common_content, refu
 from naibu.imaging.volume_correlation.gauss_newton import (
     INSIDE_INCLUSION,
     SAMPLE_TOLERANCE,
-    STEP_TOLERANCE,
     CorrelationFit,
     Iterations,
     cell_kinds,
@@ -45,6 +44,7 @@ from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_
 from naibu.imaging.volume_correlation.results.block_displacements import block_displacements
 from naibu.imaging.volume_correlation.results.cell_errors import misplacement_variance
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
+from naibu.imaging.volume_correlation.results.hidden_dilatation import TrialParts, hidden_dilatation
 from naibu.imaging.volume_correlation.rigid_parts.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion, rigid_inclusions_among
 from naibu.imaging.volume_correlation.rigid_parts.rigid_initialization import RigidInitialization, correlated_shift
@@ -52,8 +52,8 @@ from naibu.imaging.volume_correlation.settings import REFERENCE_FRACTION, Correl
 from naibu.imaging.volume_correlation.spline_grid import SplineGrid
 from naibu.imaging.volume_correlation.volume_changes import (
     DEMANDED,
-    DOUBTED,
     DRAWS,
+    LATE_DRAWS,
     demanded_dilatation,
     may_swell,
     released_weights,
@@ -311,8 +311,7 @@ class Correlation:
         # of cells whose volume changes no more than elsewhere
         self.common_dilatation = float(self.dilatation[0])
         self.most_dilatation = self.common_dilatation / (FIRST_DILATATION * self.dilatation_factor)
-        # cells with weights of their own, and what the weights of others might have to be
-        self.dilating, self.lowest = np.zeros(len(fit.system.cells), dtype=bool), np.full(len(fit.system.cells), np.inf)
+        self.dilating = np.zeros(len(fit.system.cells), dtype=bool)  # cells with weights of their own
 
     def adapt(self) -> None:
         """Choose the weights of the penalties by the data, and fit once more."""
@@ -355,12 +354,10 @@ class Correlation:
                 return
             demand = demanded_dilatation(fit, noise(), self.c)
             more = may_swell(fit, some, most) & (demand > DEMANDED) & ~self.dilating
-            lower = released_weights(fit, self.common_dilatation, demand)
-            self.lowest = np.where(some & (demand > DOUBTED), lower, np.inf)
             if not more.any():
                 return
             self.dilating |= more
-            self.dilatation = np.where(more, lower, self.dilatation)
+            self.dilatation = np.where(more, released_weights(fit, self.common_dilatation, demand), self.dilatation)
             settle()
 
     def reweigh(self, samples: Float32Array) -> bool:
@@ -378,21 +375,18 @@ class Correlation:
         stiffer = float(np.median(self.bending[fit.system.inner] / bent[fit.system.inner]))
         return self.common_dilatation > 0.5 * common and stiffer < MOST_STIFFER
 
-    def loosened(self, assemble: Callable[[], Float32Array]) -> Float32Array:
-        """Return how the coefficients (n, 3), mm, would change if volume might where the data do not decide on it.
+    def tried(self, matrix: Float32Array) -> tuple[TrialParts, Float32Array]:
+        """Return trial parts that swell, and the loads (n, 3, s) that the matrix (n, 3, 1029) of the intensities alone makes of them."""
+        trial = TrialParts.of(self.fit.system)
+        return trial, self.fit.system.multiplied(matrix, trial.coefficients)
 
-        `assemble` assembles the equations at the present weights, and returns the right side.
+    def hidden(self, tried: tuple[TrialParts, Float32Array], noise: Float32Array) -> tuple[FloatArray, FloatArray]:
+        """Return the variances (m,) of `hidden_dilatation`; the equations are assembled at the present weights.
+
+        `tried` is what `tried` returned, and `noise` (n, 3, s) are coefficients of noise alone.
         """
-        system, kept = self.fit.system, (self.bending, self.dilatation)
-        doubted = self.lowest < self.dilatation
-        if not doubted.any():
-            return np.zeros((system.n, 3), np.float32)
-        # what swells bends about it: the weight that was adapted to a field that keeps its volume would not let it
-        first = np.where(doubted[:, None], self.weights(system, 1.0)[0], np.inf)
-        self.bending, self.dilatation = np.minimum(self.bending, first), np.minimum(self.dilatation, self.lowest)
-        step = system.solved(assemble(), STEP_TOLERANCE)[0]
-        self.bending, self.dilatation = kept
-        return step
+        some = (self.fit.system.gauss_volume > 0.0) & (self.kinds < INSIDE_INCLUSION) & (self.dilatation > 0.0)
+        return hidden_dilatation(self.fit, self.c, *tried, noise, some)
 
     def depth_mm(self, level: ImageLevel) -> Float32Array:
         """Return the distance (n,) of the listed voxels of the finest level from the surface, mm; the ends of the volume are none."""
@@ -409,11 +403,9 @@ class Correlation:
         fit.reliability = None
         fit.compare(self.c)
 
-        def assemble() -> Float32Array:
-            return system.assembled(self.c, fit.products, fit.force, self.bending, self.dilatation * system.gauss_volume)
-
-        loose = self.loosened(assemble)
-        assemble()
+        system.sum_intensities(fit.products)
+        tried, dilatation = self.tried(system.matrix), self.dilatation * system.gauss_volume
+        system.assembled(self.c, fit.products, fit.force, self.bending, dilatation)
         require_overlap(float(fit.seen.mean()))
         refuse_unrelated(fit)
         content = common_content(fit, self.depth_mm(fit.level))
@@ -422,11 +414,11 @@ class Correlation:
         for inclusion in self.inclusions:
             inclusion.draws.clear()
         noise = self.noise()
-        dilatation = self.dilatation * system.gauss_volume
+        hidden = self.hidden(tried, fit.noise_samples(LATE_DRAWS, noise, self.settings.seed + 3))
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
         blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2, content.unlike)
         weights = self.bending, self.dilatation
-        found = collected(self.volume, fit, self.c, samples, *weights, content, fit.cell_misfit(), loose)
+        found = collected(self.volume, fit, self.c, samples, *weights, content, fit.cell_misfit(), hidden)
         return replace(found, blocks=blocks)
 
 

@@ -169,6 +169,19 @@ class SplineSystem:
         )  # fmt: skip
         return right
 
+    def sum_intensities(self, products: Float32Array) -> None:
+        """Fill the matrix with that of the intensities alone, without penalties."""
+        none = np.zeros((len(self.cells), 3))
+        self.summed(np.zeros((*self.active.shape, 3)), products, np.zeros((len(products), 3), np.float32), none, none[:, 0])
+
+    def multiplied(self, matrix: Float32Array, coefficients: Float32Array) -> Float32Array:
+        """Return the products (n, 3, s) of a matrix (n, 3, 1029) with coefficients (n, 3, s)."""
+        given = coefficients.shape[2]
+        x = np.pad(coefficients, ((0, 1), (0, 0), (0, -given % WIDTH)))
+        out = np.empty_like(x[:-1])
+        products_of_many(matrix, self.neighbours, x, out)
+        return np.ascontiguousarray(out[:, :, :given])
+
     def solved(self, load: Float32Array, tolerance: float, most: int = 100) -> tuple[Float32Array, int]:
         """Return A^-1 load (n, 3) by conjugate gradients, preconditioned by the blocks of the nodes, and the number of iterations."""
         x, steps = self.solved_many(load[:, :, None], tolerance, most)

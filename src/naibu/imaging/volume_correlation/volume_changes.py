@@ -4,7 +4,8 @@ One weight for the whole object, of which most keeps its volume, takes most of t
 against the penalty, and the field keeps some dilatation. What noise alone would leave is known: it is that of random residuals, fitted with
 the same penalties. Where the field has many times as much, in squares, the assumption that volume changes as little as elsewhere is
 rejected (a score test), and the weight is lower by as much, as the most probable one is where the penalty takes most away
-:cite:p:`mackay1992`. Where it has some times as much, the data do not decide, and what a lower weight would change is an error.
+:cite:p:`mackay1992`. What it has beyond noise alone elsewhere is an error: see
+`naibu.imaging.volume_correlation.results.hidden_dilatation`.
 """
 
 from __future__ import annotations
@@ -14,16 +15,16 @@ import numpy as np
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 
-# empirical: mean square of the dilatation, in those of noise alone, above which it may not be noise, and above which it is not. Where
-# volume is kept it is 0.5 to 1, and at most 3; in legs more than 5 in one cell of twenty, where bending is penalised too much
-DOUBTED, DEMANDED = 2.0, 5.0
+# empirical: mean square of the dilatation, in those of noise alone, above which it is not noise. Where volume is kept it is 0.5 to 1, and
+# at most 3; in legs more than 5 in one cell of twenty, where bending is penalised too much
+DEMANDED = 5.0
 # empirical: mean square of the dilatation, in that of the largest weight, above which a cell may have a weight of its own; and in that of
 # half of the cells, which one cell has to exceed: else volume changes alike everywhere, and one weight serves them all. Balls and chests
 # that change their volume smoothly reach 2.4 to 4.7, bodies of which a part swells 9 and more
 EXPECTED, UNLIKE = 3.0, 6.0
 WINDOW = 1.0  # cells: standard deviation of the window in which they are compared
 LARGEST = 0.5  # dilatation, up to which the weight of a part that swells lets volume change
-DRAWS = 4  # random fields of noise alone
+DRAWS, LATE_DRAWS = 4, 8  # random fields of noise alone: while the weights are adapted, and for what stays hidden
 
 
 def squared_dilatation(fit: CorrelationFit) -> FloatArray:

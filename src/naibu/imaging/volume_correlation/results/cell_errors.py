@@ -95,18 +95,33 @@ def strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, b
 
     Both parts are as those of the displacement: the samples, and the `biases`, whose direction is unknown, three times.
     """
-    system = fit.system
-    deformation = np.eye(3) + _gradients_at_middles(fit, c)
-    full = np.zeros((*system.active.shape, 3))
-
-    def mean_square(coefficients: Float32Array) -> FloatArray:
-        full[system.active] = coefficients
-        change = np.swapaxes(deformation, -1, -2) @ _gradients_at_middles(fit, full)
-        return np.asarray(((0.5 * (change + np.swapaxes(change, -1, -2))) ** 2).mean(axis=(-2, -1)))
-
-    drawn = sum((mean_square(samples[..., s]) for s in range(samples.shape[2])), start=np.zeros(len(system.cells)))
-    biased = sum((mean_square(coefficients) for coefficients in bias), start=np.zeros(len(system.cells)))
+    zero, deformation = np.zeros(len(fit.system.cells)), deformation_at_middles(fit, c)
+    drawn = sum((strain_square(deformation, gradients_of(fit, samples[..., s])) for s in range(samples.shape[2])), start=zero)
+    biased = sum((strain_square(deformation, gradients_of(fit, coefficients)) for coefficients in bias), start=zero)
     return _averaged(fit, drawn / samples.shape[2] + 3.0 * biased)
+
+
+def deformation_at_middles(fit: CorrelationFit, c: FloatArray) -> FloatArray:
+    """Return the deformation gradients (m, 3, 3) of splines c (NZ, NY, NX, 3) in the middles of the cells, along the axes of the volume."""
+    return np.asarray(np.eye(3) + _gradients_at_middles(fit, c))
+
+
+def gradients_of(fit: CorrelationFit, change: Float32Array) -> FloatArray:
+    """Return du_i/dx_j (m, 3, 3) of a change of coefficients (n, 3), mm, in the middles of the cells."""
+    full = np.zeros((*fit.system.active.shape, 3))
+    full[fit.system.active] = change
+    return _gradients_at_middles(fit, full)
+
+
+def strain_square(deformation: FloatArray, gradients: FloatArray) -> FloatArray:
+    """Return the mean square (m,) of a component of the Green-Lagrange strain of a change with gradients (m, 3, 3)."""
+    strained = np.swapaxes(deformation, -1, -2) @ gradients
+    return np.asarray(((0.5 * (strained + np.swapaxes(strained, -1, -2))) ** 2).mean(axis=(-2, -1)))
+
+
+def dilatation_square(deformation: FloatArray, gradients: FloatArray) -> FloatArray:
+    """Return the square (m,) of what a change with gradients (m, 3, 3) adds to the ratio of volumes, to first order."""
+    return np.asarray((np.linalg.det(deformation) * np.trace(np.linalg.solve(deformation, gradients), axis1=1, axis2=2)) ** 2)
 
 
 def _gradients_at_middles(fit: CorrelationFit, c: FloatArray) -> FloatArray:

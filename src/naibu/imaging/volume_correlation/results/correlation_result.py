@@ -283,20 +283,19 @@ def collected(
     dilatation: FloatArray,
     content: CommonContent,
     misfit: FloatArray,
-    loose: Float32Array,
+    hidden: tuple[FloatArray, FloatArray],
 ) -> CorrelationResult:
     """Return the result of a fit at full resolution.
 
     `samples` (n, 3, s) are random coefficients about c. Soft cells whose content is not in both volumes are not answered. `misfit` (m, 3)
-    is that of `CorrelationFit.cell_misfit` at full resolution, and `loose` (n, 3), mm, how the coefficients would change if volume might,
-    where the data do not decide on it.
+    is that of `CorrelationFit.cell_misfit` at full resolution, and `hidden` two variances (m,): those of `hidden_dilatation`.
 
     Notes
     -----
     The samples hold the error of fields as rough, and as far from constant volume, as the penalties assume. That of others is a bias, whose
     size is estimated by smoothing the field once more, as in Tukey's twicing :cite:p:`tukey1977`, and by penalising its dilatation once
     more. Its direction is not: what a penalty took from the true field was not parallel to what it takes from its estimate. Both are
-    therefore added as variances along every axis. So is what volume might do where the data do not decide on it, and what large
+    therefore added as variances along every axis. So is what a part may have swollen by while noise hides it, and what large
     residuals tell of structures that no smooth field brings together, such as those on either side of organs that slide on each other.
     """
     system, level = fit.system, fit.level
@@ -323,15 +322,16 @@ def collected(
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
         full[~valid] = np.nan
-    # which is the size of an error in an unknown direction, a third of whose square lies along every axis
-    bias = *biases(fit, c, bending, dilatation), loose / np.float32(np.sqrt(3.0))
+    bias = biases(fit, c, bending, dilatation)
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
     misplaced = misplacement_variance(fit, misfit, content.unlike)
-    biased = bias_variance(fit, bias)
+    biased = bias_variance(fit, bias) + hidden[0]
     variance = biased + remaining + misplaced
     spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
     covariance = per_cell(system.grid, fit, spread)
-    strain_sd = np.sqrt(strain_variance(fit, c, samples, bias) + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2)
+    strain_sd = np.sqrt(
+        strain_variance(fit, c, samples, bias) + hidden[1] + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
+    )
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     of_strain, of_bias, of_place, bent, dilated = (

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtri
 
 from naibu.core.arrays import Float32Array, FloatArray, Int32Array, IntArray
 from naibu.core.progress import Progress, report_progress
@@ -22,6 +23,10 @@ STEPS, CONVERGED_MM = 6, 1e-3  # Gauss-Newton steps, and the step at which they 
 # empirical: an inclusion is rigid if its mean bounded residual is at most so many times that of the field, which also fits noise
 RIGID = 1.3
 LEAST_VOXELS = 50  # too few for six unknowns and a test
+# what noise and texture enclose by chance fills up to 8 cells, bones of legs 22 and more. In units of the least volume: below, a rigid
+# motion has to fit better than the field, or the field stands, which fits as well. It does so by chance in one volume of so many
+CHANCE, FALSE = 5.0, 0.01
+CORRELATED = 8.0  # voxels that share a squared residual: (2 pi)^(3/2) sigma^3 after smoothing by 0.8 voxels
 # empirical: parts do not belong to an inclusion whose bounded residual is so much larger, in residual variances, than that of the field, or
 # whose displacement is so far from it, voxels; removed so many times
 WORSE, APART, PRUNED = 0.15, 0.6, 2
@@ -233,8 +238,23 @@ def rigid_inclusions_among(
         displacement = comparison.displacement[inclusion.voxels]
         inclusion.start(displacement)
         inclusion.fit(comparison)
-        free = float(inclusion.misfits(comparison, inclusion.points + displacement).mean())
-        rigid = float(inclusion.misfits(comparison, inclusion.moved).mean())
-        if given or (rigid < RIGID * free and np.count_nonzero(inclusion.root_weight) >= LEAST_VOXELS):
+        free = inclusion.misfits(comparison, inclusion.points + displacement)
+        rigid = inclusion.misfits(comparison, inclusion.moved)
+        as_good = rigid.mean() < RIGID * free.mean() and np.count_nonzero(inclusion.root_weight) >= LEAST_VOXELS
+        if given or (as_good and (size_mm3 > CHANCE * least_mm3 or fits_better(rigid - free, count))):
             out.append(inclusion)
     return out
+
+
+def fits_better(excess: FloatArray, trials: int) -> bool:
+    """Return whether the bounded squared residuals of a rigid motion fall below those of the field by more than chance.
+
+    Parameters
+    ----------
+    excess : ndarray, shape (n,)
+        Those of the rigid motion less those of the field.
+    trials : int
+        Candidates among which it is one, 1 or more.
+    """
+    error = float(excess.std()) * np.sqrt(CORRELATED / len(excess))
+    return bool(excess.mean() < ndtri(FALSE / trials) * error)
