@@ -167,7 +167,7 @@ def compared_block(
     solving = state.stage != "noise"
     gain = fit.lattice.normal_equations(fit.value, fit.robust_weight) if solving else (np.zeros((0, 0)), np.zeros(0))
     none = np.zeros((m, 3)), np.zeros(m)
-    load = fit.system.summed(np.zeros((*grid.shape, 3)), fit.products, fit.force, *none) if solving else np.zeros((0, 3), np.float32)
+    load = fit.system.assembled(np.zeros((*grid.shape, 3)), fit.products, fit.force, *none) if solving else np.zeros((0, 3), np.float32)
     weighted = np.where(fit.seen, fit.residual * np.sqrt(fit.weight), 0) if state.lagged else None
     products, pairs = (np.zeros(0),) * 2 if weighted is None else (lags(v) for v in lagged_products(part.mask, weighted))
     at_end = state.stage == "covariance"

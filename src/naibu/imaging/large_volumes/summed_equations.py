@@ -290,7 +290,7 @@ class SummedEquations:
         return np.asarray(right + sums.load - back)
 
     def _settle(self, sums: _Sums, about: FloatArray, steps: int = 1) -> None:
-        """Solve for the coefficients with the present weights; each step leaves a tenth of what the one before left."""
+        """Solve for the coefficients with the present weights; each step leaves a seventh of what the one before left."""
         for _ in range(steps):
             step, _ = self.system.solved(self._assembled(sums, about), STEP_TOLERANCE)
             self.coarse.c = self.coarse.c.copy()

@@ -77,7 +77,7 @@ SEARCHES, RELEASED_STEPS = 2, 2  # for parts that swell, and Gauss-Newton steps 
 UNSETTLED = 0.05  # fraction of the cells that still move, above which these steps go on: large strains of small volumes need more
 MOST_STIFFER = 2.0  # median factor on the weights of bending, above which they are adapted once more
 # the last steps are solved more exactly: what is left of a step is an error like any other
-POLISH = Iterations(2, stop_voxels=0.003, tolerance=0.02)
+POLISH = Iterations(2, stop_voxels=0.003, tolerance=0.03)
 LEAST_WEIGHT = 1e-3  # of the dilatation weight of the round before
 DEFAULT = CorrelationSettings()
 

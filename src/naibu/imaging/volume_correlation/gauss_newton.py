@@ -22,8 +22,9 @@ from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion
 
 # relative accuracy of the linear solves: a Gauss-Newton step is repeated, and random fields by which weights are chosen need not be exact;
-# those of the covariance do, since conjugate gradients find the smooth part last, which is most of it under stiff penalties
-STEP_TOLERANCE, SAMPLE_TOLERANCE, COVARIANCE_TOLERANCE = 0.1, 0.06, 0.003
+# those of the covariance do, since conjugate gradients find the smooth part last, which is most of it under stiff penalties; in the norm of
+# the preconditioner, in which errors of energy are about as large
+STEP_TOLERANCE, SAMPLE_TOLERANCE, COVARIANCE_TOLERANCE = 0.15, 0.08, 0.003
 SAMPLES_AT_ONCE = 16  # right sides of one solve, which bound the memory
 # empirical, fractions of the unknowns: at least so many count as determined by the data of a kind, and a cell's own weight starts from the
 # common one with the worth of so many

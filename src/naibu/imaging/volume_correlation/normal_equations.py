@@ -21,6 +21,8 @@ from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
 INSIDE = 0.5  # empirical: fraction of a cell in the object above which its dilatation is penalised
 REACH = 7  # nodes along an axis with which a cubic B-spline overlaps
 APART = 3  # rows of cells that share nodes with one row
+BLOCK = (2, 2, 2)  # nodes along z, y, x whose equations precondition together
+ROUNDING = 1e-4  # of the diagonal, added to it in preconditioners: equations in single precision may else not be definite
 
 
 class SplineSystem:
@@ -62,6 +64,7 @@ class SplineSystem:
         # weight of the volume of a Gauss point, mm^3, where the cell lies in the object
         self.gauss_volume = np.where(self.fraction > INSIDE, np.prod(grid.step_mm) / 8, 0.0)
         self.matrix = np.empty((self.n, 3, 3 * REACH**3), np.float32)
+        self._inverse: Float32Array | None = None
         self.bending_energy, self.dilatation_energy = np.zeros((len(self.cells), 3), np.float32), np.zeros(len(self.cells), np.float32)
 
     @property
@@ -111,6 +114,21 @@ class SplineSystem:
         self.neighbours = np.empty((n, REACH**3), np.int32)
         for o in range(REACH**3):
             self.neighbours[:, o] = wide[z + o // 49, y + (o // 7) % 7, x + o % 7]
+        self._divide_nodes()
+
+    def _divide_nodes(self) -> None:
+        """Divide the nodes into blocks: `members` (b, 8) of each, `there` (b, 8), which of them there are, and their `place` (n,)."""
+        at = np.stack(self.nodes, axis=1)
+        block = np.unique(at // BLOCK, axis=0, return_inverse=True)[1].ravel()
+        within = np.ravel_multi_index(tuple((at % BLOCK).T), BLOCK)
+        self.place = block * int(np.prod(BLOCK)) + within
+        self.members = np.zeros((block.max() + 1, int(np.prod(BLOCK))), np.int64)
+        self.members.flat[self.place] = np.arange(self.n)
+        self.there = np.zeros(self.members.shape, dtype=bool)
+        self.there.flat[self.place] = True
+        inside = np.array(list(np.ndindex(*BLOCK)))
+        # where the second node of two stands among the neighbours of the first
+        self.pair_neighbours = (inside[None] - inside[:, None] + REACH // 2) @ (REACH**2, REACH, 1)
 
     def at_middles(self, coefficients: Float32Array, *, every: bool = False) -> FloatArray:
         """Return the field (k, 3) of coefficients (n, 3) in the middles of the cells that lie in the object, or of every cell."""
@@ -144,22 +162,8 @@ class SplineSystem:
 
         To the matrix one that is given (n, 3, 1029) is added.
         """
-        right = self.summed(c, products, force, bending, dilatation, given)
-        middle = 3 * (REACH**3 // 2)
-        self.inverse = np.linalg.inv(self.matrix[:, :, middle : middle + 3].astype(float)).astype(np.float32)
-        return right
-
-    def summed(
-        self,
-        c: FloatArray,
-        products: Float32Array,
-        force: Float32Array,
-        bending: FloatArray,
-        dilatation: FloatArray,
-        given: Float32Array | None = None,
-    ) -> Float32Array:
-        """Do what `assembled` does, without the preconditioner, which a part of the cells alone may not have."""
         self.matrix[:] = 0 if given is None else given
+        self._inverse = None
         right = np.zeros((self.n, 3), np.float32)
         self.bending_energy[:], self.dilatation_energy[:] = 0, 0
         assemble(
@@ -183,7 +187,7 @@ class SplineSystem:
         return np.ascontiguousarray(out[:, :, :given])
 
     def solved(self, load: Float32Array, tolerance: float, most: int = 100) -> tuple[Float32Array, int]:
-        """Return A^-1 load (n, 3) by conjugate gradients, preconditioned by the blocks of the nodes, and the number of iterations."""
+        """Return A^-1 load (n, 3) by conjugate gradients, preconditioned by blocks of nodes, and the number of iterations."""
         x, steps = self.solved_many(load[:, :, None], tolerance, most)
         return x[:, :, 0], steps
 
@@ -194,7 +198,7 @@ class SplineSystem:
         r = loads.copy() if single else np.pad(loads, ((0, 0), (0, 0), (0, -given % WIDTH)))
         x = np.zeros_like(r)
         p, ap = np.zeros((n + 1, *r.shape[1:]), np.float32), np.empty_like(r)
-        z = self.inverse @ r
+        z = self.preconditioned(r)
         p[:n] = z
         rz = first = _dot(r, z)
         steps = 0
@@ -207,7 +211,7 @@ class SplineSystem:
             alpha = (rz / np.maximum(_dot(p[:n], ap), 1e-30)).astype(np.float32)
             x += alpha * p[:n]
             r -= alpha * ap
-            z = self.inverse @ r
+            z = self.preconditioned(r)
             new = _dot(r, z)
             if (new <= tolerance**2 * first).all():
                 break
@@ -215,6 +219,24 @@ class SplineSystem:
             p[:n] += z
             rz = new
         return np.ascontiguousarray(x[:, :, :given]), steps
+
+    def preconditioned(self, r: Float32Array) -> Float32Array:
+        """Return the solutions (n, 3, s) of the equations of blocks of nodes, each without its neighbours, for residuals (n, 3, s)."""
+        if self._inverse is None:  # of a part of the cells alone there may be none
+            self._inverse = self._inverted_blocks()
+        blocks, samples = len(self.members), r.shape[2]
+        apart = self._inverse @ r[self.members].reshape(blocks, -1, samples)
+        return np.asarray(apart.reshape(-1, 3, samples)[self.place])
+
+    def _inverted_blocks(self) -> Float32Array:
+        """Return the inverses (b, 24, 24) of the matrices of blocks of nodes; places without a node stand apart from the others."""
+        there, size = self.there, 3 * self.members.shape[1]
+        pairs = self.matrix.reshape(self.n, 3, -1, 3)[self.members[:, :, None], :, self.pair_neighbours, :]
+        pairs[~(there[:, :, None] & there[:, None, :])] = 0
+        whole = pairs.transpose(0, 1, 3, 2, 4).reshape(-1, size, size).astype(float)
+        k = np.arange(size)
+        whole[:, k, k] = np.where(np.repeat(there, 3, axis=1), (1.0 + ROUNDING) * whole[:, k, k], 1.0)
+        return np.linalg.inv(whole).astype(np.float32)
 
     def bending_load(self, c: FloatArray, bending: FloatArray) -> Float32Array:
         """Return the loads (n, 3) of the bending penalty of weights (m, 3) at coefficients c."""

@@ -36,7 +36,7 @@ def energies(correlation: Correlation, coefficients: Array) -> Array:
     system, n = correlation.fit.system, len(correlation.fit.residual)
     dilatation = correlation.dilatation * system.gauss_volume
     kept = system.matrix.copy()
-    system.summed(coefficients, np.zeros((n, 6), np.float32), np.zeros((n, 3), np.float32), correlation.bending, dilatation)
+    system.assembled(coefficients, np.zeros((n, 6), np.float32), np.zeros((n, 3), np.float32), correlation.bending, dilatation)
     system.matrix[:] = kept
     return np.array([(system.bending_energy * correlation.bending).sum(), (system.dilatation_energy * dilatation).sum()]) / 2.0
 
