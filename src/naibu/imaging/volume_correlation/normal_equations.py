@@ -176,7 +176,7 @@ class SplineSystem:
     def sum_intensities(self, products: Float32Array) -> None:
         """Fill the matrix with that of the intensities alone, without penalties."""
         none = np.zeros((len(self.cells), 3))
-        self.summed(np.zeros((*self.active.shape, 3)), products, np.zeros((len(products), 3), np.float32), none, none[:, 0])
+        self.assembled(np.zeros((*self.active.shape, 3)), products, np.zeros((len(products), 3), np.float32), none, none[:, 0])
 
     def multiplied(self, matrix: Float32Array, coefficients: Float32Array) -> Float32Array:
         """Return the products (n, 3, s) of a matrix (n, 3, 1029) with coefficients (n, 3, s)."""
