@@ -6,8 +6,9 @@ both sides of the estimate, as far away as its covariance reaches; a linear regr
 of curvature, gives derivatives over that range (:cite:t:`ralston1978`), in which jumps cancel. What it does not explain of the
 simulations is an error of the model that measurements have as well, since the truth lies at one such point: it counts as noise, by
 which residuals are weighed, and whose effect on the estimate is added to the covariance, with its correlations
-(:cite:t:`kennedy2001`). So do the curvature and differences between long and short steps of time, from a few points. What jumps add to
-the information of the derivatives, as errors of regressors do, is subtracted (:cite:t:`fuller1987`).
+(:cite:t:`kennedy2001`). So do the curvature and differences between long and short steps of time, from a few points. Information that
+jumps alone may pretend is taken away: how much that is, is told by exchanging what the regression leaves among its rows (a permutation
+test; :cite:t:`good2005`).
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ from naibu.identification.lattice_calibration.simulated_points import FARTHEST, 
 
 NARROWEST = 0.004  # standard deviation of relative changes of the values around the estimate, along principal axes
 SPREAD = 2.0  # of these deviations over those of the estimate: what jumps pretend falls with the square
-WIDEST = (0.01, 0.24, 0.4)  # largest one: at least, at first, and at most
+EXCHANGES = 100
+WIDEST = (0.01, 0.06, 0.24)  # largest one: at least, at first, and at most
 # by how much less a regression must leave of the simulations where these are half as far away: what they left then was curvature
 PAYS = 4.0
 ROUNDS = 8
 REACHES = 2.0  # of these deviations, how far a step follows a regression
 WORTH = 3.0  # decrease of chi-squared for each parameter that is worth another round
-TOO_FAR = 4.0  # squared, mean over the parameters: points that do not count
+TOO_FAR = 8.0  # squared, mean over the parameters: points that do not count
 WIDER = 2.0  # standard deviations over those of the points, from which the regression does not reach as far as its interval
 LONGEST = 0.4  # relative change of a value in a round
 CLOSE = 2.0  # standard deviations: a step within them ends the rounds
@@ -128,17 +130,18 @@ def regression(
     free = len(near) - p
     left = (rows - design @ slopes.T) * root / np.sqrt(weight.mean() * max(free, 1) / len(near))
     further = np.stack(errors) if errors else np.zeros((0, len(level)))
-    few = max(free, 1) / max(free - 2, 1)  # variance of Student's distribution
     parts = [
-        (left, 4.0 * few / len(near)),  # of half differences, for measurements and for the point in the middle
+        (left, 2.0 * max(free, 1) / max(free - 2, 1) / len(near)),  # of half differences; variance of Student's distribution: they are few
         (np.stack([pairs[k].even for k in near]), 1.0 / len(near)),
-        (further, (1.0 + 1.0 / max(len(further), 1)) / max(len(further) - 3, 1)),  # their mean is added to the level
+        (further, 1.0 / max(len(further) - 1, 1)),
     ]
     weights = _weights(level, sum(share * (rest**2).sum(axis=0) for rest, share in parts), points)
     uncertain = np.linalg.inv((design * weight[:, None]).T @ design) * weight.mean()  # (p, p), per variance of half a difference
     jumps = float(weights @ (left**2).mean(axis=0))
-    apparent = (slopes.T * weights) @ slopes
-    told = _told(apparent, few * jumps * uncertain) if free > 0 else np.eye(p)
+    told, apparent = np.eye(p), (slopes.T * weights) @ slopes
+    if free > 0:
+        spurious = _spurious(root * design, (left * weights) @ left.T * weight.mean(), jumps * uncertain)
+        told = _told(apparent, spurious)
     information = told @ apparent
     hessian = 0.5 * (information + information.T) + prior
     covariance = np.linalg.inv(hessian)
@@ -185,8 +188,23 @@ def _weights(level: FloatArray, mean_square: FloatArray, points: int) -> FloatAr
     return np.asarray(1.0 / (noise + mean_square))
 
 
+def _spurious(design: FloatArray, products: FloatArray, mean: FloatArray) -> FloatArray:
+    """Return the information (p, p) that what a regression leaves may pretend: its `mean`, larger by what chance makes of it.
+
+    The rows that the regression leaves, with `products` (m, m), are exchanged among the rows of its design (m, p) again and again: where
+    few kinds of jumps make them, some combination of parameters appears to be known much better than in the mean (:cite:t:`good2005`).
+    """
+    rng, root, reach = np.random.default_rng(0), np.linalg.cholesky(mean + 1e-300 * np.eye(len(mean))), np.linalg.pinv(design)
+    largest = []
+    for _ in range(EXCHANGES):
+        order = rng.permutation(len(products))
+        pretended = np.linalg.solve(root, reach @ products[np.ix_(order, order)] @ reach.T)
+        largest.append(np.linalg.eigvalsh(np.linalg.solve(root, pretended.T)).max())
+    return np.asarray(mean * max(float(np.quantile(largest, 0.95)), 1.0))
+
+
 def _told(information: FloatArray, spurious: FloatArray) -> FloatArray:
-    """Return what an apparent information (p, p), or a gradient, is multiplied by so that it is without what is spurious in the mean.
+    """Return what an apparent information (p, p), or a gradient, is multiplied by so that it is without what is spurious in it.
 
     Along combinations in which the spurious part explains all of it, nothing is left: there the weak prior holds.
     """
@@ -241,7 +259,7 @@ class LocalRegression:
         p, corrected, due = len(self.theta), False, False
         while True:
             spread = _within(SPREAD**2 * self.covariance, self._widest)
-            self._simulate(spread, self._count(spread), first=self.rounds == 0, several=due)
+            self._simulate(spread, p if self.rounds == 0 else (p + 1) // 2, first=self.rounds == 0, several=due)
             corrected, self.rounds = corrected or due, self.rounds + 1
             fit = self._fit(spread)
             sd = np.sqrt(np.diag(fit.covariance))
@@ -256,14 +274,6 @@ class LocalRegression:
             due = near
             self._adapt(fit.jumps)
 
-    def _count(self, spread: FloatArray) -> int:
-        """Return how many pairs to simulate: with those that are near enough, half as many again as unknowns, but no fewer than half."""
-        p = len(self.theta)
-        if self.rounds == 0:
-            return p
-        away = _places(self._pairs, self.theta, np.linalg.cholesky(spread))[1]
-        return min(max(p + (p + 1) // 2 - int((away < TOO_FAR).sum()), (p + 1) // 2), 2 * p)
-
     def _adapt(self, jumps: float) -> None:
         """Simulate nearer as long as the regression leaves much less there, curvature; else farther away, where jumps count less."""
         least, _, most = WIDEST
@@ -275,8 +285,7 @@ class LocalRegression:
     def _simulate(self, spread: FloatArray, count: int, *, first: bool, several: bool) -> None:
         """Simulate on both sides in random orthogonal directions, with fine steps here at `first`, at `several` points where due."""
         root, p = np.linalg.cholesky(spread), len(self.theta)
-        bases = [np.linalg.qr(self._rng.standard_normal((p, p)))[0] for _ in range(-(-count // p))]
-        directions = np.sqrt(p) * (root @ np.concatenate(bases, axis=1)).T[:count]
+        directions = np.sqrt(p) * (root @ np.linalg.qr(self._rng.standard_normal((p, p)))[0]).T[:count]
         around = [self.points.moved(self.theta, side * row) for row in directions for side in (1.0, -1.0)]
         others = [self.points.moved(self.theta, root @ self._rng.standard_normal(p) / SPREAD) for _ in range(FINE - 1)] if several else []
         fine = [self.theta, *others] if first or several else []
