@@ -356,6 +356,28 @@ def test_a_cut_at_once_goes_on_as_one_that_was_prepared(friction: float) -> None
     np.testing.assert_allclose(*motions, atol=0.01)  # mm: threads of the solver add in different orders
 
 
+def test_the_tangent_behind_a_cut_knows_the_table_on_which_the_body_lies() -> None:
+    """Without it a load would move the body, which nothing else holds, as a free mass in a step: by F h^2 / m."""
+    size = 30.0
+    mesh = box((size,) * 3, (3,) * 3, cell_type="tetra")
+    law = material(young_modulus=70.0, poisson_ratio=0.49)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    table = plane_indenter((0.0, 0.0, -0.5 * size), (0.0, 0.0, 1.0), static_friction=0.5, kinetic_friction=0.5)
+    whole = FiniteElementBody.of(mesh, assembler, fixtures=[table], gravity=(0.0, 0.0, -9810.0), background=False)
+    touched = InteractiveSimulation(whole, {})
+    for _ in range(20):
+        touched.advance()
+    touched.cut([[[0.4, y, size], [0.4, y, 0.0]] for y in (-size, size)])
+    session = touched._session
+    assert isinstance(session, RealTimeSession)
+    engine = session._engine
+    (tangent,) = engine._rest
+    load = -engine.mass[:, None] * np.array([0.0, 0.0, 9810.0])
+    moved = tangent.factors.solve(load.ravel()).reshape(-1, 3)
+    assert np.abs(moved).max() < 0.05 * 9810.0 * engine.step**2
+    touched.close()
+
+
 def test_a_lattice_is_cut_while_it_is_touched() -> None:
     touched = simulation()
     before = touched.body.engine.lattice  # type: ignore[attr-defined]
