@@ -33,7 +33,7 @@ from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import logarithms, young_and_poisson
-from naibu.identification.from_fields.regularization import cell_volumes
+from naibu.identification.from_fields.inversion.regularization import cell_volumes
 from naibu.identification.from_fields.uncertainty import cramer_rao_bound
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters

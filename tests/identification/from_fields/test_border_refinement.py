@@ -13,7 +13,7 @@ from naibu.identification.from_fields.forward.forward_model import Solvers, equi
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Bounds, first_point
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, first_point
 from naibu.identification.from_fields.regions.border_refinement import RefinedRegions, on_finer_cells, refined_borders
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
 from naibu.identification.from_fields.regions.segmentation import joined

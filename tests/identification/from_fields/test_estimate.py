@@ -17,9 +17,9 @@ from naibu.identification.from_fields.estimate import identify_field as identify
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point, logarithms, moduli_of, young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Bounds, Objective, SearchSettings, exact_step, first_point, search
-from naibu.identification.from_fields.regularization import Laplacian, TotalVariation, ZoneGraph
-from naibu.identification.from_fields.truncated_newton import RegularizedSystem, conjugate_gradients, truncated_step
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, exact_step, first_point, search
+from naibu.identification.from_fields.inversion.regularization import Laplacian, TotalVariation, ZoneGraph
+from naibu.identification.from_fields.inversion.truncated_newton import RegularizedSystem, conjugate_gradients, truncated_step
 from naibu.identification.from_fields.uncertainty import cramer_rao_bound
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters

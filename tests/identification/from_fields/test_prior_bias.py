@@ -10,7 +10,7 @@ from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, logarithms
-from naibu.identification.from_fields.gauss_newton import Objective, first_point, search
+from naibu.identification.from_fields.inversion.gauss_newton import Objective, first_point, search
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box

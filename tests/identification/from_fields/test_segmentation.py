@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, logarithms, young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Bounds, first_point
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, first_point
+from naibu.identification.from_fields.inversion.regularization import ZoneGraph
 from naibu.identification.from_fields.regions.segmentation import (
     CLEAR,
     Criterion,
@@ -20,7 +21,6 @@ from naibu.identification.from_fields.regions.segmentation import (
     merged,
     segment,
 )
-from naibu.identification.from_fields.regularization import ZoneGraph
 from naibu.meshing.primitives import box
 from naibu.reproduction.chapter3.bodies import LAYERS, cube
 

@@ -11,9 +11,9 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, logarithms, young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Bounds, Objective, first_point
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, first_point
+from naibu.identification.from_fields.inversion.regularization import Laplacian, ZoneGraph
 from naibu.identification.from_fields.mesh_error import extrapolated, relative_change, stretch_of
-from naibu.identification.from_fields.regularization import Laplacian, ZoneGraph
 from naibu.identification.from_fields.uncertainty import (
     Uncertainty,
     cramer_rao_bound,

@@ -24,7 +24,7 @@ from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 from naibu.imaging.volume_correlation.rigid_parts.rigid_initialization import RigidInitialization
 from naibu.imaging.volume_correlation.settings import CorrelationSettings
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 
 Array = np.ndarray
 Map = Callable[[Array], Array]

@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 
 from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
-from naibu.imaging.volume_correlation._spline_kernels import product
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
-from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import InclusionMotion, RigidInclusion
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+from naibu.imaging.volume_correlation.splines._spline_kernels import product
+from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable
 
 Array = np.ndarray
 SPACING = np.array([1.0, 1.2, 1.5])

@@ -8,9 +8,9 @@ from scipy.interpolate import BSpline
 
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import JITTER, ComparisonSettings, IntensityComparison
-from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, amplitude_of, coloured, lagged_products, lost_to_robustness
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 
 Array = np.ndarray
 SPACING = np.array([0.8, 1.0, 1.3])

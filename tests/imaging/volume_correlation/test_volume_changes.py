@@ -10,7 +10,7 @@ import pytest
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 from naibu.imaging.volume_correlation.results.hidden_dilatation import APART, RADIUS, _displacement, _from_nearest
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 from naibu.validation.specimens.intruded_body import intruded_body
 from naibu.validation.specimens.swollen_body import MIDDLE_MM, SwollenBody, SwollenSphere, swollen_body
 

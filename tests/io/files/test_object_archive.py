@@ -12,7 +12,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 from naibu.io.files.object_archive import packed, unpacked
 
 

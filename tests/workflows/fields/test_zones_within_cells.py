@@ -20,9 +20,9 @@ from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import logarithms
 from naibu.identification.from_fields.forward.zones_within_cells import moduli_within_cells, parts_within_cells
-from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.field_prediction import displacement_under_moved_sides, predict_moved_sides
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody, zones_of_cells
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.mesh_error import doubt_of, one_cell_thick
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import write_volume

@@ -35,7 +35,7 @@ from naibu.identification.from_fields.forward.sensitivities import (
     young_and_poisson,
 )
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt, moduli_within_cells
-from naibu.identification.from_fields.gauss_newton import (
+from naibu.identification.from_fields.inversion.gauss_newton import (
     Bounds,
     Found,
     Objective,
@@ -45,6 +45,9 @@ from naibu.identification.from_fields.gauss_newton import (
     first_point,
     search,
 )
+from naibu.identification.from_fields.inversion.regularization import Regularization, RegularizationName, ZoneGraph, regularization
+from naibu.identification.from_fields.inversion.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
+from naibu.identification.from_fields.inversion.truncated_newton import truncated_step
 from naibu.identification.from_fields.mesh_error import (
     COARSE,
     at_least_to,
@@ -65,10 +68,7 @@ from naibu.identification.from_fields.regions.border_refinement import (
     refined_regions,
 )
 from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
-from naibu.identification.from_fields.regularization import Regularization, RegularizationName, ZoneGraph, regularization
-from naibu.identification.from_fields.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
 from naibu.identification.from_fields.statement import statement
-from naibu.identification.from_fields.truncated_newton import truncated_step
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
 from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, limited_by_elements
@@ -117,7 +117,7 @@ def identify_field(
     regularization : {"automatic", "total_variation", "laplacian"} or None
         Penalty on jumps between neighbouring zones. Automatic is total variation for more than `FEW` zones, none for fewer.
     weight : {"discrepancy", "l_curve"} or float
-        How much the penalty weighs (see `naibu.identification.from_fields.regularization_weight.choose_weight`).
+        How much the penalty weighs (see `naibu.identification.from_fields.inversion.regularization_weight.choose_weight`).
     segmented : bool
         Whether to make regions of what was found under total variation, and to fit these without the penalty. The result are the regions
         if they explain the measurements, the regularised field otherwise.

@@ -14,7 +14,7 @@ from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, logarithms, young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Objective, SearchSettings, first_point, search
+from naibu.identification.from_fields.inversion.gauss_newton import Objective, SearchSettings, first_point, search
 from naibu.identification.from_fields.uncertainty import Uncertainty, information_at
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 

@@ -13,9 +13,9 @@ from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import Assumption
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import moduli_of, young_and_poisson
+from naibu.identification.from_fields.inversion.regularization_weight import WeightChoice
 from naibu.identification.from_fields.regions.borders import Borders
 from naibu.identification.from_fields.regions.segmentation import Segmentation
-from naibu.identification.from_fields.regularization_weight import WeightChoice
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals
 from naibu.identification.from_fields.verdict_within_cells import DETERMINED, ROUGHLY
 from naibu.identification.verdict import Verdict

@@ -20,7 +20,7 @@ from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Z
 from naibu.identification.from_fields.identified.field_prediction import displacement_under_moved_sides
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.identified.sides import loaded_nodes
-from naibu.identification.from_fields.regularization import cell_volumes
+from naibu.identification.from_fields.inversion.regularization import cell_volumes
 from naibu.identification.from_fields.uncertainty import Uncertainty
 from naibu.meshing.point_location import interpolation_operator
 

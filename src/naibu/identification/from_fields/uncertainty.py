@@ -14,8 +14,8 @@ from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point, logarithms, young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Objective
-from naibu.identification.from_fields.truncated_newton import RegularizedSystem, conjugate_gradients
+from naibu.identification.from_fields.inversion.gauss_newton import Objective
+from naibu.identification.from_fields.inversion.truncated_newton import RegularizedSystem, conjugate_gradients
 
 UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the information below which a combination is not determined at all
 PROBES = 24

@@ -11,7 +11,7 @@ import numpy as np
 from naibu.core.arrays import AnyArray, AnyFloatArray, BoolArray, Float32Array, FloatArray, Int8Array, IntArray
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 
 MOST_CELLS = 16  # along an edge of a block: their matrix takes 90 MB
 

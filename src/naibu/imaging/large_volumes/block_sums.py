@@ -20,10 +20,10 @@ from naibu.imaging.preprocessing.volume_pair import shifted_intensity
 from naibu.imaging.volume_correlation.common_content import content_sums
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.image_level import ENOUGH, MARGIN, GainMap, ImageLevel
-from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import lagged_products
 from naibu.imaging.volume_correlation.results.block_displacements import DRAWS, RIM, BlockSums, below_surface, sums_of_blocks
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable
 from naibu.imaging.volume_correlation.volume_changes import DRAWS as NOISE_DRAWS
 
 Stage = Literal["noise", "step", "covariance"]

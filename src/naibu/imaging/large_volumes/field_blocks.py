@@ -15,7 +15,7 @@ from naibu.imaging.large_volumes.correlate_blocks import BlockwiseCorrelation
 from naibu.imaging.large_volumes.fine_outline import inside_block
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import InclusionMotion
-from naibu.imaging.volume_correlation.spline_grid import separable
+from naibu.imaging.volume_correlation.splines.spline_grid import separable
 
 
 @dataclass(frozen=True, slots=True, eq=False)

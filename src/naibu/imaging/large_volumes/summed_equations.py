@@ -19,7 +19,6 @@ from naibu.imaging.large_volumes.fine_outline import BAND
 from naibu.imaging.large_volumes.noise_tiles import NoiseTiles
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.object_mask import object_threshold
-from naibu.imaging.volume_correlation._spline_kernels import product
 from naibu.imaging.volume_correlation.common_content import content_of, require_convergence, require_overlap
 from naibu.imaging.volume_correlation.correlate import (
     ADAPTATION_SAMPLES,
@@ -40,6 +39,7 @@ from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
 from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, blocks_alike, displacement_of_blocks
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
+from naibu.imaging.volume_correlation.splines._spline_kernels import product
 from naibu.imaging.volume_correlation.volume_changes import LATE_DRAWS
 
 # Gauss-Newton steps: the first of them with voxels of an edge in between, where there are such, and the one in which weights are adapted

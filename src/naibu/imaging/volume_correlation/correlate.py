@@ -39,7 +39,6 @@ from naibu.imaging.volume_correlation.gauss_newton import (
 )
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
-from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
 from naibu.imaging.volume_correlation.results.block_displacements import block_displacements
 from naibu.imaging.volume_correlation.results.cell_errors import misplacement_variance
@@ -49,7 +48,8 @@ from naibu.imaging.volume_correlation.rigid_parts.inclusion_candidates import LE
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion, rigid_inclusions_among
 from naibu.imaging.volume_correlation.rigid_parts.rigid_initialization import RigidInitialization, correlated_shift
 from naibu.imaging.volume_correlation.settings import REFERENCE_FRACTION, CorrelationSettings
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 from naibu.imaging.volume_correlation.volume_changes import (
     DEMANDED,
     DRAWS,

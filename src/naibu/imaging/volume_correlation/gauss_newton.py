@@ -17,9 +17,9 @@ from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray
 from naibu.imaging.volume_correlation._warp_kernels import add_to_cells, shrink_gradients
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
-from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion
+from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
 
 # relative accuracy of the linear solves: a Gauss-Newton step is repeated, and random fields by which weights are chosen need not be exact;
 # those of the covariance do, since conjugate gradients find the smooth part last, which is most of it under stiff penalties; in the norm of

@@ -23,8 +23,8 @@ from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Bounds
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.regions.relative_map import identify_relative_map
 from naibu.identification.from_fields.uncertainty import Uncertainty, grade
 from naibu.identification.verdict import Explanation

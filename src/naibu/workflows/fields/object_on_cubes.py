@@ -19,7 +19,7 @@ from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.representation_error import with_noise_of_neighbours, with_representation_error
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
-from naibu.identification.from_fields.gauss_newton import Bounds
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.mesh_error import one_cell_thick
 from naibu.workflows.fields.block_mesh import BLURRED, mesh_that_shows, misplaced, moved_borders, region_in, regions_of
 from naibu.workflows.fields.border_fitting import fitted_to_borders
@@ -197,8 +197,7 @@ def identified_on_smaller_cubes(
 def still_thin(cubes: ObjectOnCubes, smaller: ObjectOnCubes, sought: Collection[str]) -> tuple[str, ...]:
     """Return zones that are one cube thick on smaller cubes, if none of those that are sought ceased to be.
 
-    Intervals reckon with such zones whatever the size of cubes, and become hardly narrower: on a virtual leg that of the muscle went from a
-    factor of 2.3 to one of 2.0, in five times the time.
+    Intervals reckon with such zones whatever the size of cubes, and become hardly narrower in several times the time.
     """
     before, after = (() if on.region_at is None else one_cell_thick(on.mesh) for on in (cubes, smaller))
     return () if set(sought) & (set(before) - set(after)) else after

@@ -25,9 +25,9 @@ from naibu.identification.from_fields.forward.forward_model import Solvers, equi
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, modulus_columns
-from naibu.identification.from_fields.gauss_newton import first_point
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.identified.sides import nodes_of_side
+from naibu.identification.from_fields.inversion.gauss_newton import first_point
 from naibu.mechanics.linear_algebra.protocols import Factorization
 from naibu.meshing.point_location import interpolation_operator, locate
 from naibu.meshing.surface import boundary_nodes

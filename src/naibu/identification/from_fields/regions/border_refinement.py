@@ -23,11 +23,11 @@ from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
-from naibu.identification.from_fields.gauss_newton import Bounds, Objective
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective
+from naibu.identification.from_fields.inversion.regularization import ZoneGraph, cell_volumes
 from naibu.identification.from_fields.mesh_error import DOUBT, DOUBT_OF_RATIO, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
 from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined
-from naibu.identification.from_fields.regularization import ZoneGraph, cell_volumes
 
 MOST_REGIONS, CANDIDATES = 6, 3  # whose borders are refined; pairs that are tried as one
 LONGEST = 0.5  # of a step: of logarithms, and of borders in cells

@@ -17,7 +17,7 @@ from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel
-from naibu.identification.from_fields.regularization import cell_volumes
+from naibu.identification.from_fields.inversion.regularization import cell_volumes
 
 WINDOW = 0.8  # standard deviation, in cells, of the window in which cells are smoothed
 REACH, NEIGHBOURS = 3.0, 64  # of that window, in standard deviations, and cells in it at most

@@ -28,8 +28,8 @@ from naibu.identification.from_fields.forward.load_cases import (
     Zones,
 )
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
-from naibu.identification.from_fields.gauss_newton import Bounds
-from naibu.identification.from_fields.regularization import cell_volumes, inner_faces
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds
+from naibu.identification.from_fields.inversion.regularization import cell_volumes, inner_faces
 from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.uncertainty import Uncertainty, young_and_poisson_slopes
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters

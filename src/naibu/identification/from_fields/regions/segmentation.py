@@ -22,8 +22,8 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Point
-from naibu.identification.from_fields.gauss_newton import Bounds, Objective, SearchSettings, search
-from naibu.identification.from_fields.regularization import BULK_WEIGHT, ZoneGraph
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, search
+from naibu.identification.from_fields.inversion.regularization import BULK_WEIGHT, ZoneGraph
 
 CLUSTERS = (20, 8)  # to begin with, one after the other: the better end counts
 LIKE = 0.005  # difference of logarithms of moduli between neighbours that belong together at once

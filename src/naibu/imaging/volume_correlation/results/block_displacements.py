@@ -20,8 +20,8 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.volume import Volume
 from naibu.imaging.volume_correlation._warp_kernels import add_to_cells
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
-from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
+from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
 
 BLOCKS = 8000  # about as many are made
 LEAST_VOXELS, LEAST_EDGE = 8, 2  # of a block, and along its edges

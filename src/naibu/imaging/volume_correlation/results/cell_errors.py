@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable
 
 VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
 SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples

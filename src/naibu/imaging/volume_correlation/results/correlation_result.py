@@ -26,7 +26,7 @@ from naibu.imaging.volume_correlation.results.cell_errors import (
     strain_variance,
 )
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import InclusionMotion
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable, separable_slice
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable, separable_slice
 
 LEAST_KNOWN = 1e-4  # weight of the known cells about a voxel, from which it is interpolated among all voxels at once
 

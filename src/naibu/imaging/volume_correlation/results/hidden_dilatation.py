@@ -13,9 +13,9 @@ import numpy as np
 
 from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
-from naibu.imaging.volume_correlation.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.results.cell_errors import deformation_at_middles, dilatation_square, gradients_of, strain_square
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 from naibu.imaging.volume_correlation.volume_changes import LARGEST, WINDOW, demanded_dilatation
 
 # cells: radius of the trial parts, and their distance. Smaller parts move their surroundings by little, larger ones are seen

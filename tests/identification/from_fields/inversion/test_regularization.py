@@ -11,9 +11,16 @@ from naibu.core.errors import InputError
 from naibu.core.status import Status
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Point
-from naibu.identification.from_fields.gauss_newton import Found
-from naibu.identification.from_fields.regularization import Laplacian, TotalVariation, ZoneGraph, cell_volumes, inner_faces, regularization
-from naibu.identification.from_fields.regularization_weight import FACTOR, SLACK, WeightTrial, choose_weight, corner
+from naibu.identification.from_fields.inversion.gauss_newton import Found
+from naibu.identification.from_fields.inversion.regularization import (
+    Laplacian,
+    TotalVariation,
+    ZoneGraph,
+    cell_volumes,
+    inner_faces,
+    regularization,
+)
+from naibu.identification.from_fields.inversion.regularization_weight import FACTOR, SLACK, WeightTrial, choose_weight, corner
 from naibu.meshing.primitives import box
 from naibu.reproduction.chapter3.bodies import square
 

@@ -13,7 +13,7 @@ import scipy.sparse as sp
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.identification.from_fields.forward.sensitivities import Linearised
-from naibu.identification.from_fields.gauss_newton import LONGEST_STEP, Objective, Step
+from naibu.identification.from_fields.inversion.gauss_newton import LONGEST_STEP, Objective, Step
 from naibu.mechanics.linear_algebra.direct import direct_solver
 
 Parts = list[FloatArray]

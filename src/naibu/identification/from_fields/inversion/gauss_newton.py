@@ -18,7 +18,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.core.status import Status
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point
-from naibu.identification.from_fields.regularization import Regularization
+from naibu.identification.from_fields.inversion.regularization import Regularization
 
 LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
 SHORTEST_FRACTION = 1e-3  # of a step, below which the search ends
@@ -203,7 +203,8 @@ def search(
     settings : SearchSettings, optional
         When to end.
     rule : callable
-        Finds a step at a linearisation: `exact_step`, or `naibu.identification.from_fields.truncated_newton.truncated_step` for many zones.
+        Finds a step at a linearisation: `exact_step`, or for many zones
+        `naibu.identification.from_fields.inversion.truncated_newton.truncated_step`.
     """
     chosen = settings or SearchSettings()
     point, value = start, objective.value(start)

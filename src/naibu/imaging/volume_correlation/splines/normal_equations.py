@@ -12,11 +12,11 @@ import numpy as np
 
 from naibu._numba.intrinsics.simd import WIDTH
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
-from naibu.imaging.volume_correlation._sample_kernels import add_random_forces, products_of_many
-from naibu.imaging.volume_correlation._spline_kernels import add_forces, add_noise, assemble, product, sample_energies
 from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
 from naibu.imaging.volume_correlation.image_level import ImageLevel
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid, separable
+from naibu.imaging.volume_correlation.splines._sample_kernels import add_random_forces, products_of_many
+from naibu.imaging.volume_correlation.splines._spline_kernels import add_forces, add_noise, assemble, product, sample_energies
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable
 
 INSIDE = 0.5  # empirical: fraction of a cell in the object above which its dilatation is penalised
 REACH = 7  # nodes along an axis with which a cubic B-spline overlaps

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from naibu.imaging.volume_correlation.image_level import ImageLevel
-from naibu.imaging.volume_correlation.normal_equations import BLOCK, ROUNDING, SplineSystem
-from naibu.imaging.volume_correlation.spline_grid import SplineGrid
+from naibu.imaging.volume_correlation.splines.normal_equations import BLOCK, ROUNDING, SplineSystem
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 
 Array = np.ndarray
 SPACING = np.array([0.8, 1.0, 1.3])

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from naibu.core.errors import InputError
-from naibu.identification.from_fields.gauss_newton import Found
+from naibu.identification.from_fields.inversion.gauss_newton import Found
 
 WeightRule = Literal["discrepancy", "l_curve"]
 SLACK = 1.05  # of the discrepancy principle: noise is hardly ever known better than that, and models are never exact

@@ -14,7 +14,7 @@ from numba import prange
 from naibu._numba.compilation import njit
 from naibu._numba.intrinsics.simd import WIDTH, load, splat, store
 from naibu.core.arrays import AnyArray
-from naibu.imaging.volume_correlation._spline_kernels import CHUNKS, add_scaled, clear, scatter
+from naibu.imaging.volume_correlation.splines._spline_kernels import CHUNKS, add_scaled, clear, scatter
 
 F = np.float32
 

@@ -1,0 +1,1 @@
+"""Minimization for moduli inside a body: Gauss-Newton and truncated Newton, regularization and its weight."""

@@ -1,0 +1,1 @@
+"""Displacements as cubic B-splines: the grid, and normal equations on it."""
