@@ -33,7 +33,7 @@ LAG = 2
 # above which a cell shows in one volume what is not in the other. A counterpart leaves 0.3 and 0.25 at most, none 1 (the texture of one
 # volume) or 2 (of both) and more. Noise has none, however much of it there is. Beside such a cell, into which what it shows may reach, less
 # is enough
-UNLIKE, LEAST_UNLIKE = 0.5, 0.25
+UNLIKE, LEAST_UNLIKE = 0.6, 0.25
 BESIDE, LEAST_BESIDE = 0.15, 0.15
 NARROW = 0.5  # cells: SD of the window in which they are compared, as narrow as so few voxels allow: what appears may be thin
 WINDOWS = (1.0, 2.0, 4.0)  # cells: SDs of the windows in which a cell is judged, the first that holds enough of the inside
