@@ -1,1 +1,1 @@
-"""Vectors (`simd`), atomic operations (`atomics`) and arguments in memory (`packed_tuples`) in kernels, each with its plain substitute."""
+"""Kernels: vectors (`simd`), atomic operations (`atomics`), no subnormal numbers (`subnormals`), arguments in memory (`packed_tuples`)."""

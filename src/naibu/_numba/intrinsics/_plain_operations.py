@@ -1,4 +1,4 @@
-"""Plain operations for one thread: the substitute of `naibu._numba.intrinsics._atomic_intrinsics` where its intrinsics do not work."""
+"""Plain operations for one thread: the substitutes of intrinsics (`_atomic_intrinsics`, `_control_register`) where these do not work."""
 
 from __future__ import annotations
 
@@ -48,3 +48,14 @@ def ticks():  # type: ignore[no-untyped-def]  # pragma: no cover
 @njit(cache=True)
 def relax():  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return at once: no other thread is waited for."""
+
+
+@njit(cache=True)
+def flush_subnormals():  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return 0: subnormal numbers stay what they are."""
+    return 0
+
+
+@njit(cache=True)
+def restore(before):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return at once: nothing was changed."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from naibu._numba.compilation import UNCOUNTED, njit
 from naibu._numba.intrinsics.simd import WIDTH, inverse_root, load, splat, store
+from naibu._numba.intrinsics.subnormals import flush_subnormals, restore
 from naibu._numba.thread_pool import JOB, begin_step, end_job, end_step, finish, first_part, following_part, next_part
 
 _FAST = {"contract", "nsz"}
@@ -142,11 +143,13 @@ def _share(control, job, data):  # type: ignore[no-untyped-def]  # pragma: no co
 @njit(cache=True, nogil=True, **UNCOUNTED)
 def explicit_worker(control, data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take parts of the jobs of `explicit_steps` while there are some."""
+    before = flush_subnormals()
     part = next_part(control)
     while part >= 0:
         _part(control[JOB], part, data)
         finish(control)
         part = next_part(control)
+    restore(before)
 
 
 @njit(cache=True, nogil=True, **UNCOUNTED)
@@ -162,6 +165,7 @@ def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untype
     same order each time.
     """
     now, fractions = data[7]
+    before = flush_subnormals()
     for n in range(len(velocity)):
         for k in range(len(now)):
             for a in range(3):
@@ -175,3 +179,4 @@ def explicit_steps(control, data, velocity, reaction):  # type: ignore[no-untype
                 reaction[n, k, a] = 0.0
                 for p in range(len(fractions)):
                     reaction[n, k, a] += fractions[p, k, a]
+    restore(before)
