@@ -9,7 +9,7 @@ import pytest
 
 from naibu.identification.from_fields.forward.sensitivities import logarithms
 from naibu.identification.from_fields.uncertainty import Uncertainty
-from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells, limited_by_elements
+from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells, with_limits
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
@@ -79,19 +79,34 @@ def test_shared_residuals_that_smaller_elements_leave_come_first() -> None:
 @pytest.mark.parametrize("judged", [EXPLAINED, IN_PART])
 def test_a_modulus_that_elements_leave_open_is_in_the_first_sentence(judged: Verdict) -> None:
     bounds = np.array([[8.0, 12.5], [8.0, 72.0]])
-    told = limited_by_elements(judged, NAMES, np.array([0.1, 0.5]), bounds)
+    told = with_limits(judged, NAMES, np.array([0.1, 0.5]), bounds)
     start, _, end = told.sentence.partition(": ")
     assert start.endswith(", but elements of this size tell Young's modulus only roughly, that of skin within a factor of 3")
     assert "muscle" not in start and end == judged.sentence.partition(": ")[2]
     assert told.reservation == told.sentence and told.ok
-    both = limited_by_elements(judged, NAMES, np.array([0.3, 0.5]), bounds).sentence
+    both = with_limits(judged, NAMES, np.array([0.3, 0.5]), bounds).sentence
     assert "that of muscle within a factor of 1.2 and that of skin within a factor of 3: " in both
+
+
+def test_what_the_measurement_leaves_open_is_in_the_first_sentence() -> None:
+    """Whatever the cause: residuals of noise say nothing of a modulus that may be a tenth or ten times as much."""
+    bounds = np.array([[8.0, 18.0], [2.0, 160.0]])
+    for of_mesh in (np.array([0.05, 0.1]), None, np.array([0.05, 1.1])):
+        told = with_limits(EXPLAINED, NAMES, of_mesh, bounds).sentence
+        assert told.startswith("Explained, but Young's modulus of skin (95 % from 2 to 160 kPa) is not determined; ")
+        assert "the measurement tells Young's modulus only roughly, that of muscle within a factor of 1.5: " in told
+    nothing = np.array([[8.0, 12.0], [0.0, np.inf]])
+    assert "Young's modulus of skin (on which there is no information) is not determined: " in (
+        with_limits(EXPLAINED, NAMES, None, nothing).sentence
+    )
+    refused = replace(EXPLAINED, explanation=Explanation.NOT_EXPLAINED)
+    assert with_limits(refused, NAMES, None, bounds) is refused
 
 
 def test_moduli_that_elements_determine_leave_the_verdict_as_it_is() -> None:
     bounds = np.array([[10.0, 12.0], [20.0, 30.0]])
-    for small in (np.array([0.05, 0.1]), np.full(2, np.nan)):
-        assert limited_by_elements(EXPLAINED, NAMES, small, bounds) is EXPLAINED
+    for small in (np.array([0.05, 0.1]), np.full(2, np.nan), None):
+        assert with_limits(EXPLAINED, NAMES, small, bounds) is EXPLAINED
     assert EXPLAINED.reservation == ""
 
 

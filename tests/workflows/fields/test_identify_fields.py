@@ -16,12 +16,13 @@ from notebooks import check_shown
 
 from naibu.cli import main
 from naibu.core.displacement_field import DisplacementField
-from naibu.core.errors import InputError
+from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.estimate import NO_REGIONS, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.uncertainty import Uncertainty
+from naibu.identification.verdict import Explanation
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
@@ -328,6 +329,25 @@ def test_noise_that_is_stated_too_small_or_not_at_all_makes_no_structure(folder:
     assert (ratio > 0.95).all() and (ratio < 1.4).all()
 
 
+def test_outliers_and_understated_noise_neither_bend_moduli_nor_blame_the_model(folder: Path) -> None:
+    """One vector in fifty is anything, and a third of the noise is stated: the answer is that of the field without either."""
+    options: dict[str, Any] = {"zones": folder / "labels.mha", "known": ["label 2=10 kPa, 0.4"], "law": "linear", "element_size_mm": 6.7}
+    field, rng = read_field(folder / "field.h5"), np.random.default_rng(3)
+    wrong = rng.random(len(field.points)) < 0.02
+    vectors = field.vectors + np.where(wrong[:, None], rng.uniform(-4.0, 4.0, field.vectors.shape), 0.0)
+    write_field(folder / "stated.h5", DisplacementField.from_arrays(field.points, vectors, sd_mm=SD_MM / 3.0))
+    run, right = identify_fields(folder / "stated.h5", **options), identify_fields(folder / "field.h5", **options)
+    told = re.search(r"(\d+) of 1500 measurements in the object are left out as outliers", " ".join(run.cautions))
+    assert told is not None and 0.9 * wrong.sum() < int(told[1]) <= wrong.sum() + 2
+    scatter = re.search(r"scatter (\S+) times as much", " ".join(run.cautions))
+    assert scatter is not None and 2.8 < float(scatter[1]) < 3.5
+    assert run.estimate.verdict is not None and run.estimate.verdict.explanation is Explanation.EXPLAINED
+    (young,), (other,) = run.estimate.intervals()[0], right.estimate.intervals()[0]
+    assert young[0] < 5.0 < young[1]
+    assert np.ptp(young) == pytest.approx(np.ptp(other), rel=0.25)
+    assert not {"outliers", "scatter"} & set(" ".join(right.notes).split())
+
+
 def test_a_map_that_no_regions_explain_says_so_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Noise counts as a fifth of what it is: what regions leave is beyond it, and the map under the penalty has no intervals."""
     monkeypatch.setattr(f"{ScannedObject.__module__}.with_noise_of_neighbours", lambda _, case: (case, 1.0))
@@ -338,6 +358,18 @@ def test_a_map_that_no_regions_explain_says_so_first(folder: Path, monkeypatch: 
     volume = np.ones(run.estimate.zones.count)
     above = (run.estimate.young_modulus > 1.0) @ volume / volume.sum()
     assert 0.4 < above < 0.6
+
+
+def test_a_map_whose_regions_find_no_equilibrium_is_the_result(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The map that was found before is not lost, as it was, to an error."""
+
+    def inverted(*_: Any) -> None:
+        raise ConvergenceError("a cell is inverted")
+
+    monkeypatch.setattr("naibu.identification.from_fields.estimate.segment", inverted)
+    run = identify_fields(folder / "field.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=10.0)
+    assert run.estimate.uncertainty is None and run.notes[0] == NO_REGIONS
+    assert "a cell is inverted" in run.estimate.steps[-1]
 
 
 @pytest.mark.parametrize(

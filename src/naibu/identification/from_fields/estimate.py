@@ -71,7 +71,7 @@ from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segm
 from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
-from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, limited_by_elements
+from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
 from naibu.identification.load_case import require_load_cases
 
 FEW = 12  # zones up to which no penalty is needed by default
@@ -234,7 +234,11 @@ class _Recipe:
             self.record(f"{penalty.name} of weight {natural:.3g}, for regions: misfit {found.point.misfit:.4g}")
             choice = replace(choice, trials=(WeightTrial(natural, found, found.point.misfit, penalty.value(found.point.theta)),), chosen=0)
             at = self.model.linearised(self.model.evaluate(found.point.theta, found.point.states))
-        regions = segment(self.model, graph, at.point, choice.taken.weight, self.bounds, self.progress)
+        try:
+            regions = segment(self.model, graph, at.point, choice.taken.weight, self.bounds, self.progress)
+        except ConvergenceError as error:
+            self.record(f"with regions of one material each no equilibrium was found ({error}): the regularised field is the result")
+            return replace(estimate, steps=tuple(self.steps), identifiability=(NO_REGIONS, *estimate.identifiability))
         return self._with_regions(estimate, regions, graph)
 
     def _rule(self) -> StepRule:
@@ -395,9 +399,8 @@ class _Recipe:
         best, (bias, left) = theta, bias_of_prior(at, quadratic)
         total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
-        if shift is not None:
-            by_elements = replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
-            judged = limited_by_elements(judged, names, by_elements, intervals(theta, total)[0])
+        by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
+        judged = with_limits(judged, names, by_elements, intervals(theta, total)[0], model.zones.unit)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         limits = (TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1])) if coarse else ()
         words = statement(judged, model.zones, theta, total, others, limits=limits, budget=budget)

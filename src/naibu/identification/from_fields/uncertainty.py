@@ -20,7 +20,9 @@ from naibu.identification.from_fields.inversion.truncated_newton import Regulari
 UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the information below which a combination is not determined at all
 PROBES = 24
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
+UNDETERMINED = 4.0  # factor within which a modulus lies at 95 %, from which it is called not determined
 POISSON_POORLY = 0.1
+NOT_DETERMINED = "not determined"
 MESH_DEPENDENT = "not determined (depends on the mesh)"
 RESOLVED = 0.5
 
@@ -206,11 +208,13 @@ def report(
 def grade(of_young: float, *, usable: bool, sure: bool, apart: bool) -> str:
     """Return in words how well Young's modulus is determined, of which `of_young` is the standard deviation of the logarithm."""
     if not np.isfinite(of_young):
-        return "not determined"
+        return NOT_DETERMINED
     if not usable:
         return "not to be used"
     if apart:
         return MESH_DEPENDENT
+    if of_young * float(ndtri(0.975)) > np.log(UNDETERMINED):
+        return NOT_DETERMINED
     best = "well" if sure else "within the model"
     return f"{best if of_young < WELL else 'roughly' if of_young < POORLY else 'poorly'} determined"
 

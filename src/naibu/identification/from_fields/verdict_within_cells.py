@@ -15,14 +15,14 @@ import numpy as np
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.mesh_error import relative_change
-from naibu.identification.from_fields.uncertainty import Uncertainty
+from naibu.identification.from_fields.uncertainty import UNDETERMINED, Uncertainty
 from naibu.identification.from_fields.verdict import SHARED
 from naibu.identification.verdict import Explanation, Verdict
 
 WITHIN = 0.5  # change of a logarithm from which a linear correction is worth nothing
 DETERMINED = 0.5  # standard deviation of a logarithm from measurement alone: 95 % intervals up to 7 times as high as low are determined
 NUMBERS = ("Young's modulus", "the shear modulus", "kappa / mu, hence Poisson's ratio,")
-ROUGHLY = 0.15  # standard deviation of ln E from the size of elements with which a modulus is known within a third, at 95 %
+ROUGHLY = 0.15  # standard deviation of ln E with which a modulus is known within a third, at 95 %
 FALLS = 0.75  # part of the misfit beyond noise that may be left on elements of half the size for these to be what explains it
 
 
@@ -117,10 +117,11 @@ def _without(judged: Verdict, names: Sequence[str], refused: BoolArray, half: Ha
     return replace(judged, explanation=part, limits=limits, mesh_dependent=tuple(names[i] for i in lost))
 
 
-def limited_by_elements(judged: Verdict, names: Sequence[str], of_mesh: FloatArray, bounds: FloatArray) -> Verdict:
-    """Return the verdict with the zones first whose modulus is known only roughly on elements of this size.
+def with_limits(judged: Verdict, names: Sequence[str], of_mesh: FloatArray | None, bounds: FloatArray, unit: str = " kPa") -> Verdict:
+    """Return the verdict with the zones first whose modulus is known only roughly, or not at all, and why.
 
-    Residuals as small as the noise do not tell such errors, so that nobody should read of an explanation before he reads of them.
+    Residuals as small as the noise tell neither errors of elements nor what the measurement leaves open, so that nobody should read of an
+    explanation before he reads of them.
 
     Parameters
     ----------
@@ -128,21 +129,34 @@ def limited_by_elements(judged: Verdict, names: Sequence[str], of_mesh: FloatArr
         On the residuals.
     names : sequence of str
         Zones.
-    of_mesh : ndarray, shape (count,)
-        Standard deviations of the logarithm of Young's modulus from the size of elements; NaN where they were not estimated.
+    of_mesh : ndarray, shape (count,), or None
+        Standard deviations of the logarithm of Young's modulus from the size of elements; None where they were not estimated.
     bounds : ndarray, shape (count, 2)
         95 % intervals of Young's modulus, kPa.
+    unit : str
+        That of moduli, none of multiples.
     """
-    rough = np.flatnonzero((of_mesh > ROUGHLY) & ~np.isin(names, judged.mesh_dependent))
-    if not len(rough) or not judged.ok:
+    if not judged.ok:
         return judged
-    factors = np.sqrt(bounds[rough, 1] / bounds[rough, 0])
-    each = [
-        f"that of {names[i]} " + (f"within a factor of {f:.2g}" if np.isfinite(f) else "not at all")
-        for i, f in zip(rough.tolist(), factors, strict=True)
-    ]
-    known = f"elements of this size tell Young's modulus only roughly, {' and '.join(each)}"
-    return replace(judged, limits=f"{judged.limits}; {known}" if judged.limits else known)
+    with np.errstate(divide="ignore"):
+        factors = np.sqrt(bounds[:, 1] / bounds[:, 0])
+    told = ~np.isin(names, judged.mesh_dependent)
+    lost = told & ~(factors <= UNDETERMINED)
+    by_elements = told & ~lost & (of_mesh is not None and of_mesh > ROUGHLY)
+    by_data = told & ~lost & ~by_elements & (factors > np.exp(1.96 * ROUGHLY))
+    limits = [judged.limits] if judged.limits else []
+    if lost.any():
+        each = [f"{names[i]} ({_between(float(bounds[i, 0]), float(bounds[i, 1]), unit)})" for i in np.flatnonzero(lost).tolist()]
+        limits.append(f"Young's modulus of {' and '.join(each)} is not determined")
+    for who, rough in (("elements of this size tell", by_elements), ("the measurement tells", by_data)):
+        each = [f"that of {names[i]} within a factor of {factors[i]:.2g}" for i in np.flatnonzero(rough).tolist()]
+        limits += [f"{who} Young's modulus only roughly, {' and '.join(each)}"] * bool(each)
+    return replace(judged, limits="; ".join(limits)) if limits else judged
+
+
+def _between(low: float, high: float, unit: str) -> str:
+    """Return a 95 % interval in words."""
+    return f"95 % from {low:.3g} to {high:.3g}{unit}" if np.isfinite(high) and low > 0.0 else "on which there is no information"
 
 
 def _told_open(name: str, which: IntArray, half: HalfSize, zone: int) -> str:

@@ -26,7 +26,7 @@ from naibu.identification.from_fields.forward.sensitivities import young_and_poi
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.regions.relative_map import identify_relative_map
-from naibu.identification.from_fields.uncertainty import Uncertainty, grade
+from naibu.identification.from_fields.uncertainty import MESH_DEPENDENT, NOT_DETERMINED, Uncertainty, grade
 from naibu.identification.verdict import Explanation
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
@@ -319,10 +319,15 @@ def _cards(result: FieldIdentification) -> list[Card]:
         return []
     how = _grades(found, found.uncertainty)
     rows = zip(found.zones.names[:MOST_CARDS], found.young_modulus, found.intervals()[0], how, strict=False)
-    return [
-        Card(f"Young's modulus, {name}", f"{e:.3g} {result.unit}", f"95 % from {low:.3g} to {high:.3g}, {word}")
-        for name, e, (low, high), word in rows
-    ]
+    return [_card(name, result.unit, e, low, high, word) for name, e, (low, high), word in rows]
+
+
+def _card(name: str, unit: str, young: float, low: float, high: float, how: str) -> Card:
+    """Return the card of a zone; where its modulus is not determined, the best fit is no result and stands behind the interval."""
+    label = f"Young's modulus, {name}"
+    if how in (NOT_DETERMINED, MESH_DEPENDENT):
+        return Card(label, how, f"95 % from {low:.3g} to {high:.3g} {unit}, best fit {young:.3g}")
+    return Card(label, f"{young:.3g} {unit}", f"95 % from {low:.3g} to {high:.3g}, {how}")
 
 
 def _as_records(table: Table) -> list[dict[str, Cell]]:

@@ -23,6 +23,7 @@ from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.mesh_error import one_cell_thick
 from naibu.workflows.fields.block_mesh import BLURRED, mesh_that_shows, misplaced, moved_borders, region_in, regions_of
 from naibu.workflows.fields.border_fitting import fitted_to_borders
+from naibu.workflows.fields.contradicted_measurements import without_contradicted
 from naibu.workflows.fields.known_zones import KnownZones
 from naibu.workflows.fields.measured_load_case import measured_load_case
 
@@ -76,9 +77,13 @@ class ScannedObject:
         if not each_cell and wrong >= BLURRED:
             mesh, cell_of_voxel = fitted_to_borders(mesh, cell_of_voxel, self.inside, regions_of(self.labels, self.names))
             left_out, wrong = misplaced(mesh, cell_of_voxel, self.inside, self.labels, self.names)
-        cases = [measured_load_case(mesh, cell_of_voxel, self.inside, field, name, self.loaded) for name, field in self.fields]
-        coarser = [with_noise_of_neighbours(mesh, case) if each_cell else with_representation_error(mesh, case) for case in cases]
-        words = tuple(text for more, found in coarser for text in _told(more, found, each_cell=each_cell))
+        all_measured = [measured_load_case(mesh, cell_of_voxel, self.inside, field, name, self.loaded) for name, field in self.fields]
+        cases, outliers = zip(*map(without_contradicted, all_measured), strict=True)
+        words = tuple(text for told in outliers for text in told)
+        noisy = [with_noise_of_neighbours(mesh, case) if each_cell or case.field.covariance is not None else (case, 1.0) for case in cases]
+        words += tuple(text for case, factor in noisy for text in _told_noise(case, factor))
+        coarser = [(case, 0.0) if each_cell else with_representation_error(mesh, case) for case, _ in noisy]
+        words += tuple(UNRESOLVED.format(case.name, 100 * part) for case, part in coarser if part > 0.0)
         within = None if each_cell or wrong < BLURRED else region_in(self.inside, self.labels, self.names)
         return ObjectOnCubes(self, mesh, cell_of_voxel, tuple(case for case, _ in coarser), words, left_out, wrong, within)
 
@@ -134,14 +139,12 @@ class ObjectOnCubes:
         )  # fmt: skip
 
 
-def _told(case: FieldLoadCase, found: float, *, each_cell: bool) -> tuple[str, ...]:
-    """Say what counts as noise: by how much more than stated it is in a map, else in which part of the points cubes cannot follow."""
-    if not each_cell:
-        return (UNRESOLVED.format(case.name, 100 * found),) if found > 0.0 else ()
-    if np.isnan(found):
+def _told_noise(case: FieldLoadCase, factor: float) -> tuple[str, ...]:
+    """Say by how much more than stated the noise is."""
+    if np.isnan(factor):
         assert case.field.covariance is not None
         return (UNSTATED.format(case.name, float(np.sqrt(case.field.covariance[0, 0, 0]))),)
-    return (UNDERSTATED.format(case.name, found),) if found > 1.0 else ()
+    return (UNDERSTATED.format(case.name, factor),) if factor > 1.0 else ()
 
 
 def smaller_size(volume_mm3: float, mesh: Mesh, most: int) -> float | None:

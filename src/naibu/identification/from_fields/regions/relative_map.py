@@ -31,7 +31,8 @@ from naibu.identification.from_fields.forward.sensitivities import young_and_poi
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.inversion.regularization import cell_volumes, inner_faces
 from naibu.identification.from_fields.statement import statement
-from naibu.identification.from_fields.uncertainty import Uncertainty, young_and_poisson_slopes
+from naibu.identification.from_fields.uncertainty import Uncertainty, intervals, young_and_poisson_slopes
+from naibu.identification.from_fields.verdict_within_cells import with_limits
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 
@@ -124,10 +125,13 @@ def _relative(found: FieldEstimate) -> FieldEstimate:
     theta, uncertainty = _divided(found.theta, unit), relative_to(found.uncertainty, found.theta, zone)
     others = tuple(replace(one, theta=_divided(one.theta, float(one.theta[zone]))) for one in found.assumptions)
     regularized = found.regularized and (found.regularized[0] / np.exp(unit), found.regularized[1])
-    words = _in_words(found, theta, uncertainty, others)
+    assert found.verdict is not None  # of regions that were fitted without a penalty
+    judged = with_limits(replace(found.verdict, limits=""), found.zones.names, None, intervals(theta, uncertainty)[0], "")
+    found = replace(found, verdict=judged)
     return replace(
-        found, theta=theta, uncertainty=uncertainty, assumptions=others, regularized=regularized, identifiability=words, budget=None
-    )
+        found, theta=theta, uncertainty=uncertainty, assumptions=others, regularized=regularized, budget=None,
+        identifiability=_in_words(found, theta, uncertainty, others),
+    )  # fmt: skip
 
 
 def _divided(theta: FloatArray, unit: float) -> FloatArray:

@@ -19,10 +19,11 @@ import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
 from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.errors import ConvergenceError
 from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Point
-from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, search
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, first_point, search
 from naibu.identification.from_fields.inversion.regularization import BULK_WEIGHT, ZoneGraph
 
 CLUSTERS = (20, 8)  # to begin with, one after the other: the better end counts
@@ -268,11 +269,21 @@ def segment(
         Of the moduli.
     progress : callable, optional
         Gets a report after every number of clusters.
+
+    Raises
+    ------
+    ConvergenceError
+        With no number of clusters an equilibrium was found.
     """
     criterion = Criterion.of(model, graph, start, weight)
     found: list[tuple[float, IntArray, Point, int]] = []
     for most in CLUSTERS:
-        labels, point, moved = _from_clusters(model, criterion, start, bounds, most)
+        try:
+            labels, point, moved = _from_clusters(model, criterion, start, bounds, most)
+        except ConvergenceError:
+            if most == CLUSTERS[-1] and not found:
+                raise
+            continue
         found.append((criterion.value(labels, point), labels, point, moved))
         text = f"{most} clusters made {int(labels.max()) + 1} regions, misfit {point.misfit:.4g}"
         report_progress(progress, text, done=len(found), total=len(CLUSTERS), objective=point.misfit)
@@ -281,7 +292,7 @@ def segment(
     labels = np.argsort(order)[labels]
     zones = joined(model.zones, labels)
     regions = model.with_zones(zones)
-    point = regions.evaluate(point.theta.reshape(2, -1)[:, order].ravel(), point.states)
+    point = _at(regions, point.theta.reshape(2, -1)[:, order].ravel(), point)
     point = search(regions, point, Objective(bounds=bounds)).point
     return Segmentation(labels, zones, point, max(CLUSTERS), moved)
 
@@ -332,7 +343,7 @@ def _from_clusters(model: FieldModel, criterion: Criterion, start: Point, bounds
     labels = clusters(graph, start.theta, most)
     volume = np.bincount(labels, graph.volume)
     theta = np.concatenate([np.bincount(labels, graph.volume * t) / volume for t in start.theta.reshape(2, -1)])
-    point, moved = model.with_zones(joined(model.zones, labels)).evaluate(theta, start.states), 0
+    point, moved = _at(model.with_zones(joined(model.zones, labels)), theta, start), 0
     for _ in range(ROUNDS):
         fitted = model.with_zones(joined(model.zones, labels))
         quadratic = _scaled(fitted.linearised(point).concentrated(np.eye(len(point.theta))), criterion.scale)
@@ -348,6 +359,18 @@ def _from_clusters(model: FieldModel, criterion: Criterion, start: Point, bounds
     return labels, point, moved
 
 
+def _at(model: FieldModel, theta: FloatArray, near: Point) -> Point:
+    """Return the point at moduli, with the motion of the surface of a point before, or one that suits these moduli better.
+
+    Where the noise of the measurement is a large part of the strain in a cell, the surface that was found with a cell of one modulus may
+    turn it inside out with another.
+    """
+    try:
+        return model.evaluate(theta, near.states)
+    except ConvergenceError:
+        return first_point(model, theta)
+
+
 def _scaled(quadratic: Concentrated, scale: float) -> Concentrated:
     return replace(quadratic, hessian=quadratic.hessian / scale, gradient=quadratic.gradient / scale)
 
@@ -357,14 +380,14 @@ def _refitted(model: FieldModel, labels: IntArray, theta: FloatArray, near: Poin
     kept, labels = np.unique(labels, return_inverse=True)
     regions = model.with_zones(joined(model.zones, labels))
     objective = Objective(bounds=bounds)
-    start = regions.evaluate(objective.clipped(theta.reshape(2, -1)[:, kept].ravel()), near.states)
+    start = _at(regions, objective.clipped(theta.reshape(2, -1)[:, kept].ravel()), near)
     return labels.astype(np.int64), search(regions, start, objective, ROUGHLY).point
 
 
 def _with_better_borders(
     model: FieldModel, criterion: Criterion, labels: IntArray, point: Point, bounds: Bounds
 ) -> tuple[IntArray, Point, int]:
-    everywhere = model.evaluate(point.theta.reshape(2, -1)[:, labels].ravel(), point.states)
+    everywhere = _at(model, point.theta.reshape(2, -1)[:, labels].ravel(), point)
     quadratic = _scaled(model.linearised(everywhere).concentrated(np.eye(2 * criterion.graph.count)), criterion.scale)
     found, moves = border_moves(criterion.graph, labels, point.theta, quadratic, criterion.weight)
     if not moves:
