@@ -237,6 +237,34 @@ def _corners(x: Any, y: Any, z: Any, low: AnyArray, step: AnyArray, n: IntArray,
         w[q] = (fx if a else 1 - fx) * (fy if b else 1 - fy) * (fz if c else 1 - fz)
 
 
+@njit(cache=True, fastmath=True, error_model="numpy")
+def _add_line(sums: AnyArray, i: int, y: Any, z: Any, low: AnyArray, step: AnyArray, n: IntArray, left: AnyArray, right: AnyArray) -> None:
+    """Add the sums (13,) over voxels of a line in cell i along x to the normal equations, and clear them.
+
+    Weighted squares of the value, values, and ones, for the pairs of the two weights along x; then products with the intensity.
+    """
+    py, pz = (y - low[1]) / step[1], (z - low[2]) / step[2]
+    j, k = max(min(int(py), n[1] - 2), 0), max(min(int(pz), n[2] - 2), 0)
+    fy, fz = py - j, pz - k
+    for q in range(4):
+        wq = (fy if q & 1 else 1 - fy) * (fz if q >> 1 else 1 - fz)
+        row = 2 * (((k + (q >> 1)) * n[1] + j + (q & 1)) * n[0] + i)
+        for a in range(2):
+            right[row + 2 * a] += wq * sums[9 + 2 * a]
+            right[row + 2 * a + 1] += wq * sums[10 + 2 * a]
+            for r in range(4):
+                w = wq * (fy if r & 1 else 1 - fy) * (fz if r >> 1 else 1 - fz)
+                column = 2 * (((k + (r >> 1)) * n[1] + j + (r & 1)) * n[0] + i)
+                for b in range(2):
+                    s = 3 * (a + b)
+                    left[row + 2 * a, column + 2 * b] += w * sums[s]
+                    left[row + 2 * a, column + 2 * b + 1] += w * sums[s + 1]
+                    left[row + 2 * a + 1, column + 2 * b] += w * sums[s + 1]
+                    left[row + 2 * a + 1, column + 2 * b + 1] += w * sums[s + 2]
+    for k in range(13):
+        sums[k] = 0.0
+
+
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
 def gain_normal_equations(
     intensity: AnyArray,
@@ -249,25 +277,38 @@ def gain_normal_equations(
     left: AnyArray,
     right: AnyArray,
 ) -> None:
-    """Add the normal equations of ``intensity = gain value + offset``, trilinear on a lattice, to left and right, one for each thread."""
+    """Add the normal equations of ``intensity = gain value + offset``, trilinear on a lattice, to left and right, one for each thread.
+
+    Voxels are listed along lines, over which sums are taken before they go to the corners of a cell of the lattice.
+    """
     parts = len(left)
     for t in prange(parts):
-        ids, w8 = np.empty(8, np.int64), np.empty(8)
+        sums, i, y, z = np.zeros(13), 0, F(0), F(0)
         for p in range(t * len(intensity) // parts, (t + 1) * len(intensity) // parts):
             if value[p] < F(0.9 * OUTSIDE) or weight[p] <= 0:
                 continue
-            _corners(index[p, 0], index[p, 1], index[p, 2], low, step, n, ids, w8)
-            g = float(value[p])
-            for q in range(8):
-                a, wq = 2 * ids[q], weight[p] * w8[q]
-                right[t, a] += wq * g * intensity[p]
-                right[t, a + 1] += wq * intensity[p]
-                for r in range(8):
-                    b, v = 2 * ids[r], wq * w8[r]
-                    left[t, a, b] += v * g * g
-                    left[t, a, b + 1] += v * g
-                    left[t, a + 1, b] += v * g
-                    left[t, a + 1, b + 1] += v
+            px = (index[p, 0] - low[0]) / step[0]
+            here = max(min(int(px), n[0] - 2), 0)
+            if here != i or index[p, 1] != y or index[p, 2] != z:
+                _add_line(sums, i, y, z, low, step, n, left[t], right[t])
+                i, y, z = here, index[p, 1], index[p, 2]
+            f, g, w = px - i, float(value[p]), float(weight[p])
+            w0, w1 = w * (1 - f), w * f
+            w00, w01, w11 = w0 * (1 - f), w0 * f, w1 * f
+            sums[0] += w00 * g * g
+            sums[1] += w00 * g
+            sums[2] += w00
+            sums[3] += w01 * g * g
+            sums[4] += w01 * g
+            sums[5] += w01
+            sums[6] += w11 * g * g
+            sums[7] += w11 * g
+            sums[8] += w11
+            sums[9] += w0 * g * intensity[p]
+            sums[10] += w0 * intensity[p]
+            sums[11] += w1 * g * intensity[p]
+            sums[12] += w1 * intensity[p]
+        _add_line(sums, i, y, z, low, step, n, left[t], right[t])
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")

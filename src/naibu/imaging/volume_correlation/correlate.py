@@ -15,6 +15,7 @@ the data :cite:p:`mackay1992`. Rigid inclusions have a rigid motion each. Coarse
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -183,10 +184,10 @@ class Correlation:
         if any(max(a.start, b.start) >= min(a.stop, b.stop) for a, b in zip(*self.views, strict=True)):
             raise InputError("reference and deformed do not overlap: no voxel is known in both; check the transform that registered them")
         self.reference, self.deformed = filled_pair(reference, deformed, self.views)
-        self.mask = mask_in_view(reference, self.views[0], margin=1) if mask is None else require_mask(mask, reference)
-        self.mask = self.mask & in_box(self.views[0], reference.shape)
         self.deformed_volume = deformed
-        self.deformed_mask = None if deformed_mask is None else require_mask(deformed_mask, deformed, name="deformed_mask")
+        with ThreadPoolExecutor(2) as pool:
+            first, second = pool.submit(self._found, reference, mask, 0, 1), pool.submit(self._found, deformed, deformed_mask, 1, 0)
+        self.mask, self.deformed_mask = first.result() & in_box(self.views[0], reference.shape), second.result()
         where = np.argwhere(self.mask)
         if not len(where):
             raise InputError("mask is empty: it holds no voxel of the object")
@@ -202,6 +203,12 @@ class Correlation:
         self.ratio, self.dilatation_factor = 1.0, 1.0
         self.c = np.zeros_like(self.grid.nodes_mm)
         self.starts = [self.c]
+
+    def _found(self, volume: Volume, mask: ArrayLike | None, number: int, margin: int) -> BoolArray:
+        """Return the object in the first or the second volume, by a mask where one is given."""
+        if mask is None:
+            return mask_in_view(volume, self.views[number], margin=margin)
+        return require_mask(mask, volume, name=("mask", "deformed_mask")[number])
 
     def level(self, stride: tuple[int, ...], smoothing: float) -> ImageLevel:
         """Return the voxels at a resolution."""
@@ -241,8 +248,8 @@ class Correlation:
             both[:] = True
         scene = np.where(both[thin], self.deformed[thin], self.deformed[both].mean())
         shifts = [np.zeros(3), correlated_shift(self.reference[thin] * (self.mask & both)[thin], scene, level.spacing)]
-        shown = mask_in_view(self.deformed_volume, self.views[1]) if self.deformed_mask is None else self.deformed_mask
-        after, before = (np.argwhere(m & both if (m & both).any() else m)[:, ::-1] * self.spacing for m in (shown, self.mask))
+        shown = self.deformed_mask, self.mask
+        after, before = (np.argwhere(m & both if (m & both).any() else m)[:, ::-1] * self.spacing for m in shown)
         shifts.append(after.mean(axis=0) - before.mean(axis=0))
         start = RigidInitialization(level)
         motions = start.found(shifts)

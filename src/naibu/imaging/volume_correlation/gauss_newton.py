@@ -222,10 +222,12 @@ class CorrelationFit(IntensityComparison):
         for inclusion in self.inclusions:
             sensitivity[inclusion.voxels] = 0
         rng = np.random.default_rng((seed, count))
-        loads = self.system.random_loads(sensitivity, (noise.draw(rng) for _ in range(count)))
+        loads = self.system.random_loads(sensitivity, noise.draws(rng, count))
         return self.system.solved_many(loads, SAMPLE_TOLERANCE)[0]
 
     def _random_loads(self, sensitivity: Float32Array, count: int, noise: ResidualNoise | None, rng: np.random.Generator) -> Float32Array:
+        if noise is not None and not self.inclusions:
+            return self.system.random_loads(sensitivity, noise.draws(rng, count))
         held: list[list[FloatArray]] = []
 
         def residuals() -> Iterator[Float32Array]:

@@ -133,7 +133,7 @@ class IntensityComparison:
     @property
     def gradient_correlation(self) -> float:
         """Correlation of the image intensity gradients of both volumes over all voxels that are seen."""
-        both = self.agreement[self.seen].sum(axis=0, dtype=np.float64)
+        both = self.agreement.sum(axis=0, dtype=np.float64)  # zero where nothing is seen
         return float(both[[0, 3, 5]].sum() / max(float(both[[6, 9, 11]].sum()), 1e-30))
 
     def anchor(self, first: Float32Array, fraction: float) -> None:

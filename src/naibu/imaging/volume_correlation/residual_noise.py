@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 
 from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array
@@ -31,14 +33,29 @@ class ResidualNoise:
     """
 
     def __init__(self, mask: BoolArray, weighted: Float32Array, scale: float = 1.0) -> None:
-        self.mask, self.scale = mask, scale
+        self.scale = scale
         self.shape = padded_shape(mask.shape)
-        self.amplitude = amplitude_of(*lagged_products(mask, weighted))
+        self.factors = np.float32(scale) * _factors(amplitude_of(*lagged_products(mask, weighted)), self.shape)
+        self.places = np.ravel_multi_index(np.nonzero(mask), self.shape)
 
     def draw(self, rng: np.random.Generator) -> Float32Array:
         """Return random residuals (n,) of the voxels."""
-        nz, ny, nx = self.mask.shape
-        return np.asarray(self.scale * coloured(self.amplitude, self.shape, rng)[:nz, :ny, :nx][self.mask], dtype=np.float32)
+        return self._residuals(_spectrum(self.factors, rng))
+
+    def draws(self, rng: np.random.Generator, count: int) -> Iterator[Float32Array]:
+        """Give `count` times what `draw` returns; numbers are drawn while those before are transformed in a second thread."""
+        with ThreadPoolExecutor(1) as pool:
+            before = None
+            for _ in range(count):
+                job = pool.submit(self._residuals, _spectrum(self.factors, rng))
+                if before is not None:
+                    yield before.result()
+                before = job
+            if before is not None:
+                yield before.result()
+
+    def _residuals(self, spectrum: NDArray[np.complex64]) -> Float32Array:
+        return np.asarray(_transformed(spectrum, self.shape).ravel().take(self.places), dtype=np.float32)
 
 
 def lost_to_robustness(weights: float, derivatives: float) -> float:
@@ -71,11 +88,24 @@ def amplitude_of(products: AnyFloatArray, pairs: AnyFloatArray) -> Float32Array:
 
 def coloured(amplitude: Float32Array, shape: Sequence[int], rng: np.random.Generator) -> Float32Array:
     """Return a random periodic field (nz, ny, nx) of the given amplitudes (nz, ny, nx // 2 + 1), drawn frequency by frequency."""
-    spectrum = rng.standard_normal((*amplitude.shape, 2), dtype=np.float32).view(np.complex64)[..., 0]
-    spectrum *= amplitude
-    spectrum *= np.float32(np.sqrt(0.5 * np.prod(shape)))
+    return _transformed(_spectrum(_factors(amplitude, shape), rng), shape)
+
+
+def _factors(amplitude: Float32Array, shape: Sequence[int]) -> Float32Array:
+    """Return standard deviations of the random coefficients of a real Fourier transform with these amplitudes."""
+    factors = np.asarray(amplitude * np.float32(np.sqrt(0.5 * np.prod(shape))), dtype=np.float32)
     # of two frequencies of opposite sign one is drawn; where both are in the array the transform takes their mean
-    spectrum[..., 0] *= np.float32(np.sqrt(2.0))
+    factors[..., 0] *= np.float32(np.sqrt(2.0))
     if shape[-1] % 2 == 0:
-        spectrum[..., -1] *= np.float32(np.sqrt(2.0))
-    return np.asarray(fft.irfftn(spectrum, shape, workers=2), dtype=np.float32)
+        factors[..., -1] *= np.float32(np.sqrt(2.0))
+    return factors
+
+
+def _spectrum(factors: Float32Array, rng: np.random.Generator) -> NDArray[np.complex64]:
+    spectrum = rng.standard_normal((*factors.shape, 2), dtype=np.float32).view(np.complex64)[..., 0]
+    spectrum *= factors
+    return spectrum
+
+
+def _transformed(spectrum: NDArray[np.complex64], shape: Sequence[int]) -> Float32Array:
+    return np.asarray(fft.irfftn(spectrum, shape, workers=2, overwrite_x=True), dtype=np.float32)

@@ -29,7 +29,7 @@ MOST_SD = 2.0  # voxels, along the least certain direction: linear gradients rea
 RIM = 2  # voxels from the surface, where air is mixed in, that are left out
 FAR = 9.0  # mean square of a step, in variances, from which the splines are too far off for one step
 LEFT = 0.5  # empirical: of the bias of the splines, what a step leaves: 0.5 to 0.8 in vessels and bone of legs, less elsewhere
-DRAWS = 8  # of correlated noise: one factor for all blocks follows from them
+DRAWS = 4  # of correlated noise: one factor for all blocks follows from them, to half a per cent
 UPPER = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
@@ -84,7 +84,7 @@ def block_displacements(volume: Volume, fit: CorrelationFit, noise: ResidualNois
     """
     inner = below_surface(np.pad(fit.level.mask, RIM))[fit.level.mask] & fit.seen
     rng = np.random.default_rng(seed)
-    sums = sums_of_blocks(fit, inner, block_edge(int(inner.sum())), (noise.draw(rng) for _ in range(DRAWS)))
+    sums = sums_of_blocks(fit, inner, block_edge(int(inner.sum())), noise.draws(rng, DRAWS))
     alike = blocks_alike(fit.system, sums, sums.middle * fit.level.spacing, unlike)
     return displacement_of_blocks(volume, alike, fit.level.spacing, noise.scale)
 

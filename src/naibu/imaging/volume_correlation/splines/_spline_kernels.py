@@ -20,88 +20,7 @@ CHUNKS = 64  # parts of a matrix product that threads take: many more than threa
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _moments(
-    products: AnyArray,
-    force: AnyArray,
-    which: AnyArray,
-    box: AnyArray,
-    wx: AnyArray,
-    wy: AnyArray,
-    wz: AnyArray,
-    m1: AnyArray,
-    m2: AnyArray,
-    m3: AnyArray,
-    f1: AnyArray,
-    f2: AnyArray,
-    load: AnyArray,
-) -> bool:
-    """Fill m3 (10, 600) with the sums over voxels of a cell of pairs of weights times products; add forces to load (64, 3).
-
-    m1 (60,), m2 (600,) and f1 (12,), f2 (48,) are work space. Pairs are numbered along z, y, x, and products last; arrays are flat, so that
-    inner loops are long.
-    """
-    found = False
-    m3[:] = F(0)
-    for z in range(box[4], box[5]):
-        m2[:] = F(0)
-        f2[:] = F(0)
-        in_slice = False
-        for y in range(box[2], box[3]):
-            if not _line(products, force, which, z, y, box, wx, m1, f1):
-                continue
-            in_slice = True
-            m = 0
-            for a in range(4):
-                for b in range(a, 4):
-                    w = wy[y, a] * wy[y, b]
-                    for k in range(60):
-                        m2[m + k] += w * m1[k]
-                    m += 60
-                for k in range(12):
-                    f2[12 * a + k] += wy[y, a] * f1[k]
-        if not in_slice:
-            continue
-        found = True
-        m = 0
-        for a in range(4):
-            for b in range(a, 4):
-                w = wz[z, a] * wz[z, b]
-                for k in range(600):
-                    m3[m, k] += w * m2[k]
-                m += 1
-            for q in range(16):
-                for k in range(3):
-                    load[16 * a + q, k] += wz[z, a] * f2[3 * q + k]
-    return found
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _line(
-    products: AnyArray, force: AnyArray, which: AnyArray, z: int, y: int, box: AnyArray, wx: AnyArray, m1: AnyArray, f1: AnyArray
-) -> bool:
-    found = False
-    for x in range(box[0], box[1]):
-        p = which[z, y, x]
-        if p < 0:
-            continue
-        if not found:
-            m1[:] = F(0)
-            f1[:] = F(0)
-            found = True
-        m = 0
-        for a in range(4):
-            for b in range(a, 4):
-                w = wx[x, a] * wx[x, b]
-                for k in range(6):
-                    m1[m + k] += w * products[p, k]
-                m += 6
-            for k in range(3):
-                f1[3 * a + k] += wx[x, a] * force[p, k]
-    return found
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _cofactor(local: AnyArray, gradients: AnyArray, q: int, cof: AnyArray) -> Any:
+def cofactor(local: AnyArray, gradients: AnyArray, q: int, cof: AnyArray) -> Any:
     """Fill cof (3, 3) with the cofactors of I + grad u at a Gauss point, and return its determinant."""
     j = np.empty((3, 3), F)
     for i in range(3):
@@ -119,79 +38,7 @@ def _cofactor(local: AnyArray, gradients: AnyArray, q: int, cof: AnyArray) -> An
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
-def _dilatation_gradients(local: AnyArray, gradients: AnyArray, ratio: Any, weight: Any, load: AnyArray, v: AnyArray, cof: AnyArray) -> Any:
-    """Fill v (8, 192) with the derivatives of det(I + grad u) at the Gauss points times sqrt(weight), and add to load (64, 3).
-
-    Returns the sum of (J - ratio)^2, twice the penalty per unit weight.
-    """
-    total, root = F(0), F(np.sqrt(weight))
-    for q in range(gradients.shape[0]):
-        e = _cofactor(local, gradients, q, cof) - ratio
-        total += e * e
-        for a in range(64):
-            for i in range(3):
-                t = root * (cof[i, 0] * gradients[q, 0, a] + cof[i, 1] * gradients[q, 1, a] + cof[i, 2] * gradients[q, 2, a])
-                v[q, 3 * a + i] = t
-                load[a, i] -= root * t * e
-    return total
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _add_bending(local: AnyArray, stiffness: AnyArray, weight: AnyArray, load: AnyArray, energy: AnyArray) -> None:
-    """Add the forces of the bending penalty of a cell to its load, and fill energy (3,), twice the penalty per unit weight."""
-    energy[:] = F(0)
-    for a in range(64):
-        s0, s1, s2 = F(0), F(0), F(0)
-        for b in range(64):
-            k = stiffness[a, b]
-            s0 += k * local[b, 0]
-            s1 += k * local[b, 1]
-            s2 += k * local[b, 2]
-        load[a, 0] -= weight[0] * s0
-        load[a, 1] -= weight[1] * s1
-        load[a, 2] -= weight[2] * s2
-        energy[0] += local[a, 0] * s0
-        energy[1] += local[a, 1] * s1
-        energy[2] += local[a, 2] * s2
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _row(
-    a: int,
-    stiffness: AnyArray,
-    weight: AnyArray,
-    m3: AnyArray,
-    pairs: AnyArray,
-    with_data: bool,
-    v: AnyArray,
-    dilatable: bool,
-    row: AnyArray,
-) -> None:
-    """Fill row (3, 192) with the matrix of a cell for its coefficient a."""
-    for b in range(64):
-        k = stiffness[a, b]
-        k0, k1, k2 = weight[0] * k, weight[1] * k, weight[2] * k
-        if with_data:
-            q = pairs[a, b]
-            xx, xy, xz, yy, yz, zz = m3[q, 0], m3[q, 1], m3[q, 2], m3[q, 3], m3[q, 4], m3[q, 5]
-            row[0, 3 * b], row[0, 3 * b + 1], row[0, 3 * b + 2] = k0 + xx, xy, xz
-            row[1, 3 * b], row[1, 3 * b + 1], row[1, 3 * b + 2] = xy, k1 + yy, yz
-            row[2, 3 * b], row[2, 3 * b + 1], row[2, 3 * b + 2] = xz, yz, k2 + zz
-        else:
-            row[0, 3 * b], row[0, 3 * b + 1], row[0, 3 * b + 2] = k0, F(0), F(0)
-            row[1, 3 * b], row[1, 3 * b + 1], row[1, 3 * b + 2] = F(0), k1, F(0)
-            row[2, 3 * b], row[2, 3 * b + 1], row[2, 3 * b + 2] = F(0), F(0), k2
-    if dilatable:
-        for i in range(3):
-            r = row[i]
-            for q in range(0, 8, 4):
-                t0, t1, t2, t3 = v[q, 3 * a + i], v[q + 1, 3 * a + i], v[q + 2, 3 * a + i], v[q + 3, 3 * a + i]
-                for b in range(192):
-                    r[b] += t0 * v[q, b] + t1 * v[q + 1, b] + t2 * v[q + 2, b] + t3 * v[q + 3, b]
-
-
-@njit(cache=True, fastmath=True, error_model="numpy")
-def _gather(c: AnyArray, cell: AnyArray, local: AnyArray) -> None:
+def gather(c: AnyArray, cell: AnyArray, local: AnyArray) -> None:
     """Fill local (64, 3) with the coefficients of a cell, relative to one of them: single precision then loses nothing."""
     z, y, x = cell[2], cell[3], cell[4]
     for a in range(64):
@@ -203,56 +50,6 @@ def _gather(c: AnyArray, cell: AnyArray, local: AnyArray) -> None:
 def clear(load: AnyArray) -> None:
     """Fill load with zeros; within a parallel kernel that would become a loop of its own, which takes seconds to compile."""
     load[:] = F(0)
-
-
-@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
-def assemble(
-    big: AnyArray,
-    right: AnyArray,
-    tasks: AnyArray,
-    cells: AnyArray,
-    slot: AnyArray,
-    c: AnyArray,
-    products: AnyArray,
-    force: AnyArray,
-    which: AnyArray,
-    starts: Any,
-    weights: Any,
-    bending: AnyArray,
-    stiffness: AnyArray,
-    dilatation: AnyArray,
-    gradients: AnyArray,
-    ratio: float,
-    pairs: AnyArray,
-    bending_energy: AnyArray,
-    dilatation_energy: AnyArray,
-) -> None:
-    """Add intensity data, bending and dilatation of all cells to big and right; fill bending_energy (m, 3) and dilatation_energy (m,)."""
-    for colour in range(len(tasks) - 1):
-        for task in prange(tasks[colour], tasks[colour + 1]):
-            m1, m2, m3 = np.empty(60, F), np.empty(600, F), np.empty((10, 600), F)
-            f1, f2, load, local = np.empty(12, F), np.empty(48, F), np.empty((64, 3), F), np.empty((64, 3), F)
-            row, v, cof, box = np.empty((3, 192), F), np.empty((8, 192), F), np.empty((3, 3), F), np.empty(6, np.int64)
-            for m in range(cells[task, 0], cells[task, 1]):
-                cell = cells[m]
-                for a in range(3):
-                    box[2 * a], box[2 * a + 1] = starts[a][cell[4 - a]], starts[a][cell[4 - a] + 1]
-                _gather(c, cell, local)
-                clear(load)
-                found = _moments(products, force, which, box, weights[0], weights[1], weights[2], m1, m2, m3, f1, f2, load)
-                _add_bending(local, stiffness, bending[m], load, bending_energy[m])
-                if dilatation[m] > 0:
-                    dilatation_energy[m] = _dilatation_gradients(local, gradients, F(ratio), dilatation[m], load, v, cof)
-                for a in range(64):
-                    _row(a, stiffness, bending[m], m3.reshape(1000, 6), pairs, found, v, dilatation[m] > 0, row)
-                    az, ay, ax = a >> 4, (a >> 2) & 3, a & 3
-                    n = slot[cell[2] + az, cell[3] + ay, cell[4] + ax]
-                    for i in range(3):
-                        right[n, i] += load[a, i]
-                        for bb in range(16):
-                            o = 3 * (((bb >> 2) - az + 3) * 49 + ((bb & 3) - ay + 3) * 7 + (3 - ax))
-                            for b in range(12):
-                                big[n, i, o + b] += row[i, 12 * bb + b]
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -350,21 +147,22 @@ def add_noise(
             for m in range(cells[task, 0], cells[task, 1]):
                 load = bending_draws[m]
                 if dilatation[m] > 0:
-                    _gather(c, cells[m], local)
+                    gather(c, cells[m], local)
                     for q in range(len(gradients)):
-                        _cofactor(local, gradients, q, cof)
+                        cofactor(local, gradients, q, cof)
                         _add_dilatation(cof, gradients[q], F(np.sqrt(dilatation[m])), dilatation_draws[m, q], load)
                 scatter(load, cells[m], slot, loads)
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _energy_of_samples(xl: AnyArray, stiffness: AnyArray, d: AnyArray) -> Any:
-    """Return the sum over samples of x . K x of xl (64, s)."""
+    """Return the sum over samples of x . K x of xl (64, s); K is symmetric."""
     e = F(0)
     for a in range(len(xl)):
         d[:] = F(0)
-        for b in range(len(xl)):
-            add_scaled(stiffness[a, b], xl[b], d)
+        for b in range(a):
+            add_scaled(F(2) * stiffness[a, b], xl[b], d)
+        add_scaled(stiffness[a, a], xl[a], d)
         e += _squares(d, xl[a])
     return e
 
@@ -404,7 +202,7 @@ def sample_energies(
     for m in prange(len(cells)):
         cell = cells[m]
         local, xl, cof, d = np.empty((64, 3), F), np.empty((3, 64, samples), F), np.empty((3, 3), F), np.empty(samples, F)
-        _gather(c, cell, local)
+        gather(c, cell, local)
         for a in range(xl.shape[1]):
             n = slot[cell[2] + (a >> 4), cell[3] + ((a >> 2) & 3), cell[4] + (a & 3)]
             for i in range(len(xl)):
@@ -414,6 +212,6 @@ def sample_energies(
             bending_energy[m, i] = _energy_of_samples(xl[i], stiffness, d) / samples
         e = F(0)
         for q in range(len(gradients)):
-            _cofactor(local, gradients, q, cof)
+            cofactor(local, gradients, q, cof)
             e += _dilatation_of_samples(cof, gradients[q], xl, d)
         dilatation_energy[m] = e / samples

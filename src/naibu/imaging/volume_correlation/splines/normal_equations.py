@@ -14,14 +14,16 @@ from naibu._numba.intrinsics.simd import WIDTH
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array, IntArray
 from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
 from naibu.imaging.volume_correlation.image_level import ImageLevel
+from naibu.imaging.volume_correlation.splines._assembly_kernels import ALONG, LINE, PRODUCTS, SLICE, assemble
 from naibu.imaging.volume_correlation.splines._sample_kernels import add_random_forces, products_of_many
-from naibu.imaging.volume_correlation.splines._spline_kernels import add_forces, add_noise, assemble, product, sample_energies
+from naibu.imaging.volume_correlation.splines._spline_kernels import add_forces, add_noise, product, sample_energies
 from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable
 
 INSIDE = 0.5  # empirical: fraction of a cell in the object above which its dilatation is penalised
 REACH = 7  # nodes along an axis with which a cubic B-spline overlaps
 APART = 3  # rows of cells that share nodes with one row
 BLOCK = (2, 2, 2)  # nodes along z, y, x whose equations precondition together
+UPPER = np.triu_indices(4)  # pairs of the four splines along an axis
 ROUNDING = 1e-4  # of the diagonal, added to it in preconditioners: equations in single precision may else not be definite
 
 
@@ -60,7 +62,7 @@ class SplineSystem:
         values, vectors = np.linalg.eigh(bending)
         self.stiffness, self.root = bending.astype(np.float32), (vectors * np.sqrt(np.maximum(values, 0))).astype(np.float32)
         self.gauss = grid.gauss_gradients().astype(np.float32)
-        self.pairs = _pair_numbers()
+        self.along, self.pairs = _along(self.weights[0]), _pair_places()
         # weight of the volume of a Gauss point, mm^3, where the cell lies in the object
         self.gauss_volume = np.where(self.fraction > INSIDE, np.prod(grid.step_mm) / 8, 0.0)
         self.matrix = np.empty((self.n, 3, 3 * REACH**3), np.float32)
@@ -168,8 +170,8 @@ class SplineSystem:
         self.bending_energy[:], self.dilatation_energy[:] = 0, 0
         assemble(
             self.matrix, right, self.tasks, self.cells, self.slot, c.astype(np.float32), products, force, self.level.number, self.starts,
-            self.weights, bending.astype(np.float32), self.stiffness, dilatation.astype(np.float32), self.gauss, self.ratio, self.pairs,
-            self.bending_energy, self.dilatation_energy,
+            self.along, self.weights, bending.astype(np.float32), self.stiffness, dilatation.astype(np.float32), self.gauss, self.ratio,
+            self.pairs, self.bending_energy, self.dilatation_energy,
         )  # fmt: skip
         return right
 
@@ -313,12 +315,20 @@ def _dot(a: Float32Array, b: Float32Array) -> FloatArray:
     return np.asarray(np.einsum("nis,nis->s", a, b, dtype=np.float64))
 
 
-def _pair_numbers() -> IntArray:
-    """Return for every two splines of a cell the three digits that number their pairs along z, y, x."""
+def _pair_places() -> IntArray:
+    """Return where the sums of products for every two splines of a cell begin, and how far they are apart (64, 64, 2)."""
     one = np.zeros((4, 4), np.int64)
-    upper = np.triu_indices(4)
-    one[upper] = np.arange(10)
+    one[UPPER] = np.arange(10)
     one = np.maximum(one, one.T)
     a = np.arange(64)
-    z, y, x = a >> 4, (a >> 2) & 3, a & 3
-    return np.asarray(one[z[:, None], z] * 100 + one[y[:, None], y] * 10 + one[x[:, None], x])
+    z, y, x = (one[k[:, None], k] for k in (a >> 4, (a >> 2) & 3, a & 3))
+    first = np.where(x < 8, x, 48 + PRODUCTS * (x - 8))
+    return np.asarray(np.stack([z * SLICE + y * LINE + first, np.where(x < 8, 8, 1)], axis=2))
+
+
+def _along(weights: Float32Array) -> Float32Array:
+    """Return the numbers (n ALONG,) of voxels along x that sums are taken of, from the four weights (n, 4) of each."""
+    out = np.zeros((len(weights), ALONG), np.float32)
+    out[:, :10] = weights[:, UPPER[0]] * weights[:, UPPER[1]]
+    out[:, 10:14] = weights
+    return out.ravel()
