@@ -29,7 +29,7 @@ from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.quality import mean_edge_length
 from naibu.meshing.refinement.forest import BisectionForest
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
-from naibu.simulation.cut_sides import with_sides_of_cuts
+from naibu.simulation.cut_sides import outward_normals, with_sides_of_cuts
 from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
@@ -228,6 +228,8 @@ class FiniteElementBody:
         Of the cut that the mesh comes from, for the next one.
     lips_friction : float
         Coulomb's coefficient between the sides of the cuts to come.
+    outward : ndarray, shape (n, 3), optional
+        Normals of the blades at the nodes on the sides of their cuts; see `naibu.simulation.cut_sides.outward_normals`.
     """
 
     engine: DynamicEngine
@@ -240,6 +242,7 @@ class FiniteElementBody:
     fixtures: tuple[RigidIndenter, ...]
     forest: BisectionForest | None = None
     lips_friction: float = 0.0
+    outward: FloatArray | None = None
 
     @classmethod
     def of(
@@ -363,7 +366,8 @@ class FiniteElementBody:
         placeholder = [material(young_modulus=1.0, poisson_ratio=0.3)] * len(mesh.region_names)
         made = Assembler.from_materials(elements(found.mesh, "mean_dilatation"), found.mesh.regions, placeholder)
         made = replace(made, law_codes=assembler.law_codes[before], parameters=assembler.parameters[before])
-        made = with_sides_of_cuts(made, found.mesh, self.lips_friction)
+        outward = outward_normals(found, blade, self.outward)
+        made = with_sides_of_cuts(made, found.mesh, self.lips_friction, outward)
         held = np.isin(np.arange(mesh.n_points), self.supported).astype(float)
         body = FiniteElementBody.of(
             found.mesh, made, supported=np.flatnonzero(found.nodal(held) > 1.0 - 1e-9).astype(np.int64), fixtures=self.fixtures,
@@ -371,7 +375,7 @@ class FiniteElementBody:
             tangential_stiffness=self.engine.tangential_stiffness,
             background=not isinstance(self.engine, RealTimeEngine) or self.engine.background,
         )  # fmt: skip
-        body = replace(body, forest=found.forest, lips_friction=self.lips_friction)
+        body = replace(body, forest=found.forest, lips_friction=self.lips_friction, outward=outward)
         return body, DynamicState(found.nodal(state.displacement), found.nodal(state.velocity)), found
 
     def unbalanced(self, session: AnySession) -> float:

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from naibu.core.mesh import Mesh
-from naibu.mechanics.contact.cut_lips import STIFFNESS, cut_lips
+from naibu.mechanics.contact.cut_lips import RAMP, STIFFNESS, cut_lips
 from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import plane_indenter
 from naibu.mechanics.finite_elements.assembly import Assembler
@@ -16,24 +17,30 @@ from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDispla
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.lip_assembly import LipAssembler, with_lips
-from naibu.mechanics.finite_strain.problem import Problem
+from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import cut_volume
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_faces
+from naibu.simulation.cut_sides import outward_normals
 from naibu.simulation.interactive_bodies import FiniteElementBody
 
 SIZE = 20.0
 LAW = material("neo_hookean", young_modulus=10.0, poisson_ratio=0.3)
 
 
+def plane_blade(height, tilt=0.0, through=True):
+    """A blade that passes through the block near a height, or half way through."""
+    end = SIZE + 1.0 if through else 0.5 * SIZE
+    edge = np.array([[-1.0, -1.0, height], [-1.0, SIZE + 1.0, height + tilt]])
+    return swept_blade(np.stack([edge, edge + np.array([end + 1.0, 0.0, 0.0])]))
+
+
 def cut_block(height, tilt=0.0, through=True, n=4):
     """A block cut near a height, right through or half way, and the same cells joined again."""
     whole = box((SIZE,) * 3, (n, n, n), cell_type="tetra", centred=False)
-    end = SIZE + 1.0 if through else 0.5 * SIZE
-    edge = np.array([[-1.0, -1.0, height], [-1.0, SIZE + 1.0, height + tilt]])
-    cut = cut_volume(whole, swept_blade(np.stack([edge, edge + np.array([end + 1.0, 0.0, 0.0])])), SIZE / n).mesh
+    cut = cut_volume(whole, plane_blade(height, tilt, through), SIZE / n).mesh
     points, number = np.unique(cut.points, axis=0, return_inverse=True)
     return Mesh.from_arrays(points, number.ravel()[cut.cells], "tetra"), cut
 
@@ -82,6 +89,92 @@ def test_every_node_that_a_cut_doubled_is_in_one_pair_whatever_the_order_of_the_
         found.append((lips.with_friction(0.3).add(u, force)[0], force, lips.area.sum()))
     assert found[0][0] == pytest.approx(found[1][0], rel=1e-12) and found[0][2] == pytest.approx(found[1][2], rel=1e-12)
     np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-12 * np.abs(found[0][1]).max())
+
+
+def obliquely_cut(height, tilt, n):
+    """Mesh cut right through by a plane, the normal of the plane, which nodes lie above it, and the body with the contact of the sides."""
+    whole = box((SIZE,) * 3, (n, n, n), cell_type="tetra", centred=False)
+    blade = plane_blade(height * SIZE, tilt)
+    found = cut_volume(whole, blade, SIZE / n)
+    mesh, normal = found.mesh, np.array([0.0, -tilt, SIZE + 2.0]) / np.hypot(tilt, SIZE + 2.0)
+    centres = (mesh.points[mesh.cells].mean(axis=1) - [0.0, -1.0, height * SIZE]) @ normal
+    upper = np.bincount(found.piece, centres) > 0.0
+    above = np.zeros(mesh.n_points, dtype=bool)
+    above[mesh.cells[upper[found.piece]]] = True
+    plain = Assembler.from_materials(elements(mesh, "standard"), mesh.regions, [LAW])
+    sides = with_lips(plain, mesh.points, boundary_faces(mesh).faces, 0.0, mesh.cells, outward_normals(found, blade))
+    return mesh, normal, above, plain, sides
+
+
+OBLIQUE = [(0.47, 1.0, 5), (0.45, 4.0, 5), (0.3, 8.0, 6)]  # facets of the last two follow the plane in steps
+
+
+@pytest.mark.parametrize(("height", "tilt", "n"), OBLIQUE)
+def test_a_uniform_stress_across_an_oblique_cut_without_friction_passes_unchanged(height, tilt, n):
+    """Patch test: stretched along the plane until there is no stress along it, the body has the same strain on both sides of the cut."""
+    mesh, normal, above, plain, sides = obliquely_cut(height, tilt, n)
+    outer = ((mesh.points < 1e-9) | (mesh.points > SIZE - 1e-9)).any(axis=1)
+    lower = np.where(above[sides.lips.pairs], -1, sides.lips.pairs).max(axis=1)
+    inner = lower[~outer[lower]]
+
+    def strained(along):
+        return mesh.points @ (0.9 * np.outer(normal, normal) + along * (np.eye(3) - np.outer(normal, normal)) - np.eye(3))
+
+    def forces(along):
+        return plain.forces(strained(along))[1][inner]
+
+    riser = np.abs(forces(1.0) - np.outer(forces(1.0) @ normal, normal)).max(axis=1).argmax()
+    tangent = forces(1.0)[riser] - (forces(1.0)[riser] @ normal) * normal
+    along = brentq(lambda s: forces(s)[riser] @ tangent, 0.95, 1.1, xtol=1e-14)
+    pressure = -forces(along) @ normal / sides.lips.area[~outer[lower]]
+    assert pressure == pytest.approx(pressure.mean(), rel=1e-10)  # weights are the areas along the normal
+    overlap = abs(pressure.mean()) / sides.lips.stiffness[0] + 0.5 * RAMP * sides.lips.edge[0]
+    exact = strained(along) - overlap * np.outer(above, normal)
+    held = PrescribedDisplacement(np.repeat(outer[:, None], 3, axis=1), np.where(outer[:, None], exact, 0.0))
+    tight = SolverSettings(tolerance=1e-10)
+    found = solve(Problem(mesh.points, sides, (), held, np.zeros_like(mesh.points)), settings=tight)
+    assert found.displacement == pytest.approx(exact, abs=1e-8)
+    across, _ = sides.lips.slip_forces(found.displacement)
+    assert across.sum() == pytest.approx(abs(pressure.mean()) * SIZE**2 / normal[2], rel=0.01)  # the rim is as stepped as the mesh
+
+
+@pytest.mark.parametrize(("height", "tilt", "n"), OBLIQUE)
+def test_an_oblique_cut_without_friction_hands_over_a_force_across_it_only(height, tilt, n):
+    """The plates hold their ends, and no force but that of the cut acts in between; normals of facets gave 1.5, .6 and .5 of this slope."""
+    mesh, normal, _, _, sides = obliquely_cut(height, tilt, n)
+    low, high = mesh.points[:, 2] < 1e-9, mesh.points[:, 2] > SIZE - 1e-9
+    held = PrescribedDisplacement(
+        np.repeat((low | high)[:, None], 3, axis=1), np.where(high[:, None], np.array([0.0, 0.0, -0.02]), 0.0)
+    )  # fmt: skip
+    found = solve(Problem(mesh.points, sides, (), held, np.zeros_like(mesh.points)), settings=SolverSettings(tolerance=1e-8))
+    force = sides.forces(found.displacement)[1][high].sum(axis=0)
+    assert force[1] / force[2] == pytest.approx(normal[1] / normal[2], rel=0.01)
+    assert abs(force[0] / force[2]) < 1e-3
+
+
+def test_the_normal_of_a_cut_goes_with_the_body():
+    mesh, normal, _, _, sides = obliquely_cut(*OBLIQUE[1])
+    rng = np.random.default_rng(5)
+    gradient = np.eye(3) + 0.2 * rng.normal(size=(3, 3))
+    found = sides.lips.with_normals_of(mesh.points @ (gradient.T - np.eye(3))).normals
+    expected = np.linalg.inv(gradient).T @ normal  # Nanson's formula
+    assert np.abs(found @ expected) / np.linalg.norm(expected) == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_second_cut_leaves_the_first_its_normals_and_facets_where_they_cross():
+    mesh = box((SIZE, SIZE, SIZE), (4, 4, 4), cell_type="tetra", centred=False)
+    assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [LAW])
+    body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9).astype(np.int64))
+    level, upright = (np.array(n) / np.linalg.norm(n) for n in ([0.0, -4.0, SIZE + 2.0], [1.0, 0.0, 0.0]))
+    body, state, _ = body.cut(body.session().state(), plane_blade(0.4 * SIZE, 4.0), 5.0)
+    edge = np.array([[9.0, -1.0, -1.0], [9.0, SIZE + 1.0, -1.0]])
+    body, _, _ = body.cut(state, swept_blade(np.stack([edge, edge + np.array([0.0, 0.0, SIZE + 2.0])])), 5.0)
+    lips = body.engine.assembler.lips
+    normals = np.abs(lips.with_normals_of(np.zeros_like(body.points)).normals)
+    of_first, of_second = (np.abs(normals @ np.abs(n) - 1.0) < 1e-9 for n in (level, upright))
+    assert np.count_nonzero(of_first) > 20 and np.count_nonzero(of_second) > 20
+    assert np.count_nonzero(~of_first & ~of_second) < 0.25 * len(lips.pairs)
+    assert (np.linalg.norm(normals, axis=1) > 1.0 - 1e-9).mean() > 0.9
 
 
 def test_a_cut_block_under_tension_opens_as_without_contact():

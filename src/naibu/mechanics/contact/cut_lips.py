@@ -1,8 +1,10 @@
 """Contact of the two sides of a cut with each other: pairs of nodes that were one before the cut.
 
-Each pair resists approach along the mean normal of its two sides, as they are in the deformed body, by a penalty :cite:p:`wriggers2006`; it
-exerts nothing while it is open. Pairs are those of the cut: sides that slide past each other further than `FURTHEST` edges, or that no
-longer face each other, do not touch.
+Each pair resists approach along the normal of the cut, as it is in the deformed body, by a penalty :cite:p:`wriggers2006`; it exerts
+nothing while it is open. Where the blade's normal is known, it is carried with the cells of both sides by Nanson's formula, and a pair
+stands for the area that its facets have along it: facets that follow the blade in steps then neither interlock nor carry shear, and a
+normal stress passes unchanged. Elsewhere the normal is the mean one of the facets. Pairs are those of the cut: sides that slide past
+each other further than `FURTHEST` edges, or that no longer face each other, do not touch.
 
 With Coulomb friction a closed pair also resists slip: the elastic predictor ``e = k_t P (d - a)`` is returned to ``|e| <= mu N``; d is
 the position of the second node relative to the first, P the projection along the sides, N the force across them, and the anchor a is the
@@ -22,7 +24,10 @@ from naibu.core.errors import InputError
 RAMP = 2e-4  # of the edge: penetration over which the pressure rises smoothly
 FURTHEST = 2.0  # edges between the nodes of a pair across the normal
 STIFFNESS = 40.0  # Young's moduli (of an incompressible solid) over the edge
+LEAST_ALONG = 1e-3  # of the facets' area around a pair, that it stands for where they overhang
 TANGENTIAL = 0.5  # stiffness of a pair before it slips, of that across the sides
+
+Carriers = tuple[IntArray, IntArray, FloatArray]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,11 +43,15 @@ class CutLips:
     pairs : ndarray, shape (p, 2), int64
         Nodes on the first and on the second side; no two pairs have the same nodes.
     corner_pair : ndarray, shape (2 f, 3), int64
-        Pair that every corner of the triangles belongs to; -1 at the front of a cut, where both sides have one node.
+        Pair to whose normal every corner of the triangles contributes; -1 at the front of a cut, where both sides have one node, and where
+        the blade's normal is known.
     area : ndarray, shape (p,)
-        Tributary areas at rest, mm2.
+        Tributary areas at rest, mm2, along the normal.
     edge : ndarray, shape (p,)
-        Edge of the triangles around a pair: the root of their mean area times two, mm.
+        Edge of the triangles: the root of their mean area times two, mm.
+    carriers : tuple of ndarray
+        Cells that carry the blade's normal: their nodes (c, 4), twice the pair, and one more on its second side (c,), and what the vector
+        areas of their faces contribute to the outward normal there (c, 3).
     stiffness : ndarray, shape (p,)
         Penalties, kPa/mm.
     normals : ndarray, shape (p, 3), optional
@@ -60,6 +69,7 @@ class CutLips:
     area: FloatArray
     edge: FloatArray
     stiffness: FloatArray
+    carriers: Carriers
     normals: FloatArray | None = None
     friction: float = 0.0
     anchors: FloatArray | None = None
@@ -109,7 +119,7 @@ class CutLips:
         In a time step whose normals are those of its beginning, the energy of the pairs is convex, their forces are its gradient, and no
         pair comes in or drops out.
         """
-        gap, normal = _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
+        gap, normal = self._gaps_and_normals_at(displacement)
         return replace(self, normals=np.where(np.isfinite(gap)[:, None], normal, 0.0))
 
     def only(self, which: IntArray) -> CutLips:
@@ -165,13 +175,23 @@ class CutLips:
 
     def _gaps_and_normals(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
         if self.normals is None:
-            gap, normals = _state(self.points, self.faces, self.pairs, self.corner_pair, self.edge, np.ascontiguousarray(displacement))
-            return gap, normals
+            return self._gaps_and_normals_at(displacement)
         gap = (self.normals * self._relative(displacement)).sum(axis=1)
         return np.where(self.normals.any(axis=1), gap, np.inf), self.normals
 
+    def _gaps_and_normals_at(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return gaps (p,) and unit normals (p, 3), from the first side to the second, of all pairs at a displacement."""
+        sides = np.zeros((2, len(self.pairs), 3))
+        at = self.points + displacement
+        _add_facets(at, self.faces, self.pairs, self.corner_pair, sides)
+        _add_carried(at, *self.carriers, sides)
+        gap, normal = _state(at, self.pairs, self.edge, sides)
+        return gap, normal
 
-def cut_lips(points: FloatArray, faces: IntArray, shear_modulus: FloatArray) -> CutLips | None:
+
+def cut_lips(
+    points: FloatArray, faces: IntArray, shear_modulus: FloatArray, cells: IntArray | None = None, outward: FloatArray | None = None
+) -> CutLips | None:
     """Return the sides of cuts among the boundary faces of a mesh; None where no two faces lie on each other at rest.
 
     Parameters
@@ -182,7 +202,36 @@ def cut_lips(points: FloatArray, faces: IntArray, shear_modulus: FloatArray) -> 
         Boundary triangles, counterclockwise seen from outside.
     shear_modulus : ndarray, shape (n,)
         Of the solid around the nodes, kPa; the penalty follows from it.
+    cells : ndarray, shape (m, 4), int64, optional
+        Tetrahedra, which carry the normals of blades.
+    outward : ndarray, shape (n, 3), optional
+        Of nodes on a side of a cut, the normal of the blade in the reference configuration, outwards; zero where it is not known. Without
+        it, or where the two sides do not agree, as where cuts cross, normals are those of the facets.
     """
+    found = _pairs_of_triangles(points, faces)
+    if found is None:
+        return None
+    sides, pairs, corner = found
+    vectors = 0.5 * np.cross(points[sides[:, 1]] - points[sides[:, 0]], points[sides[:, 2]] - points[sides[:, 0]])
+    areas, k = np.linalg.norm(vectors, axis=1), np.flatnonzero(corner[: len(corner) // 2].ravel() >= 0)
+    own, of = corner.ravel()[k], np.repeat(np.arange(len(sides)), 3)[k]  # of one side of every pair of triangles
+    area = np.asarray(np.bincount(own, areas[of] / 3.0, minlength=len(pairs)), dtype=np.float64)
+    edge = np.full(len(pairs), np.sqrt(2.0 * areas.mean()))  # a uniform gap is to make a uniform pressure
+    carriers = (np.zeros((0, 4), np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
+    if cells is not None and outward is not None:
+        normal = _agreed(outward[pairs])
+        known = np.asarray(normal.any(axis=1))
+        first = np.where(sides.ravel()[k] == pairs[own, 0], 1.0, -1.0)
+        along = np.bincount(own, first * (vectors[of] * normal[own]).sum(axis=1) / 3.0, minlength=len(pairs))
+        area = np.where(known, np.maximum(along, LEAST_ALONG * area), area)
+        corner = np.where((corner >= 0) & known[corner], -1, corner)
+        carriers = _carriers(points, cells, pairs, normal)
+    stiffness = STIFFNESS * 3.0 * shear_modulus[pairs].max(axis=1) / edge
+    return CutLips(points, np.ascontiguousarray(sides), pairs, np.ascontiguousarray(corner), area, edge, stiffness, carriers)
+
+
+def _pairs_of_triangles(points: FloatArray, faces: IntArray) -> tuple[IntArray, IntArray, IntArray] | None:
+    """Return the triangles of one side and of the other (2 f, 3), pairs (p, 2), and the pair of every corner (2 f, 3), -1 at fronts."""
     place = np.unique(points, axis=0, return_inverse=True)[1].ravel()
     at = place[faces]
     order = np.argsort(at, axis=1)
@@ -197,27 +246,46 @@ def cut_lips(points: FloatArray, faces: IntArray, shear_modulus: FloatArray) -> 
     pairs, number = np.unique(np.sort(both[apart], axis=1), axis=0, return_inverse=True)  # which triangle comes first depends on its number
     corner = np.full(len(both), -1, dtype=np.int64)
     corner[apart] = number.ravel()
-    corners = points[sorted_faces[first]]
-    areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    share = np.repeat(areas / 3.0, 3)[apart]
-    area = np.asarray(np.bincount(corner[apart], share, minlength=len(pairs)), dtype=np.float64)
-    edge = np.sqrt(2.0 * 3.0 * area / np.bincount(corner[apart], minlength=len(pairs)))
-    stiffness = STIFFNESS * 3.0 * shear_modulus[pairs].max(axis=1) / edge
     oriented = [np.take_along_axis(corner.reshape(-1, 3), np.argsort(order[f], axis=1), axis=1) for f in (first, second)]
-    sides = np.concatenate([faces[first], faces[second]])
-    return CutLips(points, np.ascontiguousarray(sides), pairs, np.ascontiguousarray(np.concatenate(oriented)), area, edge, stiffness)
+    return np.concatenate([faces[first], faces[second]]), pairs, np.concatenate(oriented)
+
+
+def _agreed(outward: FloatArray) -> FloatArray:
+    """Return the normals (p, 3), from the first side to the second, of what both sides (p, 2, 3) say is outwards; zero in discord."""
+    normal = outward[:, 0] - outward[:, 1]
+    agree = (outward[:, 0] * outward[:, 1]).sum(axis=1) < -0.5 * np.linalg.norm(outward, axis=2).prod(axis=1)
+    size = np.linalg.norm(normal, axis=1)
+    return np.where(agree[:, None], normal / np.where(size > 0.0, size, 1.0)[:, None], 0.0)
+
+
+def _carriers(points: FloatArray, cells: IntArray, pairs: IntArray, normal: FloatArray) -> Carriers:
+    """Return the cells around the nodes of pairs with a normal, and what carries it: cof(F) N is ``cof(D) m``, with m = D0^T N over det D0.
+
+    D and D0 have the edges of a cell from its first node in their columns; cells count by their volumes.
+    """
+    corners = cells.ravel()
+    order, count = np.argsort(corners, kind="stable"), np.bincount(corners, minlength=len(points))
+    begin, known = np.cumsum(count) - count, np.flatnonzero(normal.any(axis=1))
+    found: list[tuple[IntArray, IntArray, FloatArray]] = []
+    for side, sign in ((0, 1.0), (1, -1.0)):
+        node = pairs[known, side]
+        many = count[node]
+        within = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
+        own, pair = cells[order[np.repeat(begin[node], many) + within] // 4], np.repeat(known, many)
+        edges = points[own[:, 1:]] - points[own[:, :1]]
+        found.append((own, 2 * pair + side, sign * np.einsum("cki,ci->ck", edges, normal[pair]) / 6.0))
+    nodes, pair, carried = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    return np.ascontiguousarray(nodes, dtype=np.int64), pair, np.ascontiguousarray(carried)
 
 
 @njit(cache=True, nogil=True)
-def _state(points, faces, pairs, corner_pair, edge, u):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Gaps (p,) and unit normals (p, 3), from the first side to the second, of all pairs."""
-    sides = np.zeros((2, len(pairs), 3))
+def _add_facets(at, faces, pairs, corner_pair, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the vector areas of facets to the outward normals (2, p, 3) of the pairs at their corners."""
     e, f = np.empty(3), np.empty(3)
     for t in range(len(faces)):
         a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
         for i in range(3):
-            e[i] = points[b, i] + u[b, i] - points[a, i] - u[a, i]
-            f[i] = points[c, i] + u[c, i] - points[a, i] - u[a, i]
+            e[i], f[i] = at[b, i] - at[a, i], at[c, i] - at[a, i]
         for k in range(3):
             p = corner_pair[t, k]
             if p >= 0:
@@ -225,6 +293,24 @@ def _state(points, faces, pairs, corner_pair, edge, u):  # type: ignore[no-untyp
                 for i in range(3):
                     j, m = (i + 1) % 3, (i + 2) % 3
                     sides[side, p, i] += e[j] * f[m] - e[m] * f[j]
+
+
+@njit(cache=True, nogil=True)
+def _add_carried(at, cells, side_of, carried, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add to the outward normals (2, p, 3) of pairs what cells carry of them; `side_of` has twice the pair, and one more of the second."""
+    for c in range(len(cells)):
+        p, side, o = side_of[c] // 2, side_of[c] % 2, cells[c, 0]
+        for k in range(3):
+            a, b = cells[c, 1 + (k + 1) % 3], cells[c, 1 + (k + 2) % 3]
+            for i in range(3):
+                j, m = (i + 1) % 3, (i + 2) % 3
+                area = (at[a, j] - at[o, j]) * (at[b, m] - at[o, m]) - (at[a, m] - at[o, m]) * (at[b, j] - at[o, j])
+                sides[side, p, i] += carried[c, k] * area
+
+
+@njit(cache=True, nogil=True)
+def _state(at, pairs, edge, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Gaps (p,) and unit normals (p, 3), from the first side to the second, of pairs with outward normals (2, p, 3)."""
     gap, normal = np.full(len(pairs), np.inf), np.zeros((len(pairs), 3))
     for p in range(len(pairs)):
         facing, size = 0.0, 0.0
@@ -238,7 +324,7 @@ def _state(points, faces, pairs, corner_pair, edge, u):  # type: ignore[no-untyp
         along, whole = 0.0, 0.0
         for i in range(3):
             normal[p, i] /= size
-            d = points[pairs[p, 1], i] + u[pairs[p, 1], i] - points[pairs[p, 0], i] - u[pairs[p, 0], i]
+            d = at[pairs[p, 1], i] - at[pairs[p, 0], i]
             along += normal[p, i] * d
             whole += d * d
         if whole - along * along <= (FURTHEST * edge[p]) ** 2:

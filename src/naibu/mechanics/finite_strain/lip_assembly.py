@@ -94,7 +94,10 @@ def with_friction(assembler: Assembler, coefficient: float) -> Assembler:
     return replace(assembler, lips=assembler.lips.with_friction(coefficient))
 
 
-def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray, friction: float = 0.0) -> Assembler:
+def with_lips(
+    assembler: Assembler, points: FloatArray, faces: IntArray, friction: float = 0.0,
+    cells: IntArray | None = None, outward: FloatArray | None = None,
+) -> Assembler:  # fmt: skip
     """Return an assembler in which the two sides of cuts do not pass through each other; the same where there is no cut.
 
     Parameters
@@ -107,13 +110,18 @@ def with_lips(assembler: Assembler, points: FloatArray, faces: IntArray, frictio
         Its boundary triangles; those that lie on each other are the sides of cuts. Quadrilaterals have no such contact.
     friction : float
         Coulomb's coefficient between the two sides.
+    cells : ndarray, shape (m, 4), int64, optional
+        Tetrahedra, which carry the normals of blades.
+    outward : ndarray, shape (n, 3), optional
+        Of nodes on a side of a cut, the normal of the blade in the reference configuration, outwards; zero where it is not known. By
+        default the sides have the normals of their facets.
 
     Raises
     ------
     InputError
         A negative coefficient.
     """
-    lips = cut_lips(points, faces, node_shear_moduli(assembler)) if faces.shape[1] == 3 else None
+    lips = cut_lips(points, faces, node_shear_moduli(assembler), cells, outward) if faces.shape[1] == 3 else None
     if lips is None:
         return assembler
     lips = lips.with_friction(friction)

@@ -26,7 +26,7 @@ def _beside(p, q, points, i, j):  # type: ignore[no-untyped-def]  # pragma: no c
 
 @njit(cache=True)
 def crosses(p, q, points, triangles, low, high, count):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return 0 where the segment from p to q crosses no triangle, else which end sees the last one counterclockwise: 1 if p, -1 if q does.
+    """Return 0 where the segment from p to q crosses no triangle, else which end sees the last one clockwise: 1 if p, -1 if q does.
 
     `low` and `high` are the boxes of the triangles, of which the first `count` are looked at.
     A segment through an edge or a vertex of a surface crosses one of its triangles, as the signs of zero volumes are agreed on.
@@ -89,9 +89,9 @@ def _square_distance(p, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no 
 
 
 @njit(cache=True)
-def distance(p, points, triangles, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Distance of a point from the nearest triangle."""
-    best = np.inf
+def _nearest(p, points, triangles, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Square of the distance of a point from the nearest triangle, and which one this is."""
+    best, found = np.inf, -1
     for t in range(len(triangles)):
         gap = 0.0
         for k in range(3):
@@ -99,8 +99,23 @@ def distance(p, points, triangles, low, high):  # type: ignore[no-untyped-def]  
             gap += beyond * beyond
         if gap < best:
             a, b, c = triangles[t, 0], triangles[t, 1], triangles[t, 2]
-            best = min(best, _square_distance(p, points[a], points[b], points[c]))
-    return np.sqrt(best)
+            square = _square_distance(p, points[a], points[b], points[c])
+            if square < best:
+                best, found = square, t
+    return best, found
+
+
+@njit(cache=True)
+def distance(p, points, triangles, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Distance of a point from the nearest triangle."""
+    return np.sqrt(_nearest(p, points, triangles, low, high)[0])
+
+
+@njit(cache=True)
+def nearest_triangles(queries, points, triangles, low, high, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Nearest triangle of every query point."""
+    for i in range(len(queries)):
+        out[i] = _nearest(queries[i], points, triangles, low, high)[1]
 
 
 @njit(cache=True)

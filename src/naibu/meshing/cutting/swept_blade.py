@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import RigidTransform
+from naibu.meshing.cutting._crossing_kernels import nearest_triangles
 
 FLAT = 1e-12  # of the square of the extent: area of a triangle that is left out
 MOST_TRIANGLES = 100_000
@@ -40,6 +41,14 @@ class SweptBlade:
     def __add__(self, other: SweptBlade) -> SweptBlade:
         """Return both surfaces."""
         return SweptBlade(np.concatenate([self.points, other.points]), np.concatenate([self.triangles, other.triangles + len(self.points)]))
+
+    def normals_near(self, points: FloatArray) -> FloatArray:
+        """Return the unit normals (k, 3) of the triangles nearest to points (k, 3), mm, from where these are counterclockwise."""
+        nearest = np.empty(len(points), dtype=np.int64)
+        nearest_triangles(np.ascontiguousarray(points), *self.arrays, nearest)
+        a, b, c = self.points[self.triangles[nearest]].transpose(1, 0, 2)
+        normal = np.cross(b - a, c - a)
+        return np.asarray(normal / np.linalg.norm(normal, axis=1)[:, None])
 
     @property
     def extent_mm(self) -> float:

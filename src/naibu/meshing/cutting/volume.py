@@ -39,8 +39,8 @@ class VolumeCut:
     source : ndarray, shape (n,), int64
         Node of the refined mesh that each node is or is a copy of.
     faces : ndarray, shape (2 f, 3), int64
-        New surface: faces of the side from which the blade's triangles are seen counterclockwise, then in the same order those of the
-        other; their nodes are counterclockwise seen from outside. Faces at the front that are not open yet are no part of it.
+        New surface: faces of the side from which the blade's triangles are seen clockwise, then in the same order those of the other;
+        their nodes are counterclockwise seen from outside. Faces at the front that are not open yet are no part of it.
     piece : ndarray, shape (m,), int64
         Piece that each cell belongs to, the one of the largest volume first.
     deviation_mm : float
