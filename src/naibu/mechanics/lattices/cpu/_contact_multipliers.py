@@ -4,8 +4,9 @@ A node carries the fraction that `_kept` tells of the pressure around it. Either
 nothing; or it is found together with the end of the step. A multiplier that follows lags behind the compression, and as a force that
 lags it feeds vibrations: of a node of mass m on a foundation of stiffness k, with ``alpha = h^2 k / m`` and ``u = 1 - 1 / z``, whose
 multiplier takes on all of the pressure, the modes are ``u^3 + alpha = 0``, which grow where alpha is below 1. In steps as short as that
-multipliers have to be found together with the end of the step. The fraction is then that of the area that a flat indenter has near, and
-not of what it presses at the time: a stiffness that changed with the compression would feed vibrations as well.
+multipliers have to be found together with the end of the step. Under flat indenters the fraction is that of the area that they have near,
+and not of what they press at the time: a stiffness that changed with the compression would feed vibrations as well, and where the lattice
+resists by its damping differences would grow by some per cent in every step.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from naibu.mechanics.lattices.model.contact_surface import PER_RADIUS, SHARED, T
 
 EARNEST = 0.25  # covered fraction of a face that counts
 BARELY, NEARLY = 0.4, 0.9  # covered fractions around a node between which it begins to carry pressure without the foundation
-MOST_KEPT = 0.9  # fraction that a node carries at most where multipliers are found with the step: at 1 nothing would bound them
+MOST_KEPT = 0.95  # fraction that a node carries at most where multipliers are found with the step: at 1 nothing would bound them
 COLUMNS = 6  # numbers of a node: see `update_multipliers`
 GAIN, COVERING, LARGEST, STIFFNESS, SHARE, BEFORE = range(COLUMNS)
 
@@ -47,9 +48,10 @@ def update_multipliers(count, form, surface, history, lists, found, nodal, fract
             for c in range(4):
                 around += covering[k, corners[f, c]] if spread[f, c] > 0.0 else 0.0
             thickness[k, f] = np.sqrt(THINNEST**2 + PER_RADIUS**2 * around / (np.pi * area))
-    if settled:
-        _gather_covered(count, surface, lists, found, nodal, UNDER)
-    _gather_fractions(count, surface, lists, found, nodal, fraction, UNDER if settled else TOUCHING)
+    if not settled:
+        _release(count, form, surface, multiplier, lists, found, nodal)
+    _gather_covered(count, form, surface, lists, found, nodal, settled)
+    _gather_fractions(count, form, surface, lists, found, nodal, fraction, settled)
     for entry in range(0 if settled else count):
         k, f = lists[0][entry], lists[1][entry]
         for c in range(4):
@@ -161,8 +163,37 @@ def _gather_stiffness(count, surface, thickness, lists, found, stiffness):  # ty
 
 
 @njit(cache=True, **UNCOUNTED)
-def _gather_covered(count, surface, lists, found, nodal, column):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add up the covered areas around the nodes, and find their inverse areas, with another covered fraction of points."""
+def _release(count, form, surface, multiplier, lists, found, nodal):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Take from the nodes the pressure that points near a flat indenter no longer exert, all of it where no point around them does."""
+    corners, _, _, shapes, weights, first, rule = surface
+    gain, covering = nodal[GAIN], nodal[COVERING]
+    for entry in range(count):
+        k, f = lists[0][entry], lists[1][entry]
+        for c in range(4):
+            if form[k, 0] == 0.0 and covering[k, corners[f, c]] == 0.0:
+                multiplier[k, corners[f, c]] = 0.0
+    for entry in range(count):
+        k, f = lists[0][entry], lists[1][entry]
+        each = rule[k + 1] - rule[k]
+        for g in range(each):
+            p, shape, carried = first[k] + f * each + g, shapes[rule[k] + g], 0.0
+            if found[p, TOUCHING] > 0.0 or found[p, UNDER] == 0.0:
+                continue
+            for c in range(4):
+                carried += shape[c] * multiplier[k, corners[f, c]]
+            for c in range(4):
+                gain[k, corners[f, c]] -= weights[p] * shape[c] * found[p, UNDER] * carried
+
+
+@njit(cache=True, **UNCOUNTED)
+def _column(form, k, settled):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the column of the covered fraction of points that counts."""
+    return UNDER if settled or form[k, 0] == 0.0 else TOUCHING
+
+
+@njit(cache=True, **UNCOUNTED)
+def _gather_covered(count, form, surface, lists, found, nodal, settled):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add up the covered areas around the nodes, and find their inverse areas, by what counts of points."""
     corners, spread, _, shapes, weights, first, rule = surface
     covering, largest = nodal[COVERING], nodal[LARGEST]
     for entry in range(count):
@@ -175,17 +206,17 @@ def _gather_covered(count, surface, lists, found, nodal, column):  # type: ignor
         for g in range(each):
             p, shape = first[k] + f * each + g, shapes[rule[k] + g]
             for c in range(4):
-                i, part = corners[f, c], weights[p] * shape[c] * found[p, column]
+                i, part = corners[f, c], weights[p] * shape[c] * found[p, _column(form, k, settled)]
                 covering[k, i] += part
                 if part > 0.0:
                     largest[k, i] = max(largest[k, i], spread[f, c])
 
 
 @njit(cache=True, **UNCOUNTED)
-def _gather_fractions(count, surface, lists, found, nodal, fraction, column):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _gather_fractions(count, form, surface, lists, found, nodal, fraction, settled):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Find how far nodes are covered: as the least covered one of the faces around them, those hardly touched left out.
 
-    `column` is that of the covered fractions of points, whose covered areas and inverse areas `nodal` holds.
+    `nodal` holds covered areas and inverse areas by what counts of points.
     """
     corners, spread, _, _, weights, first, rule = surface
     covering, largest = nodal[COVERING], nodal[LARGEST]
@@ -200,7 +231,7 @@ def _gather_fractions(count, surface, lists, found, nodal, fraction, column):  #
                 least = min(least, covering[k, corners[f, c]] * largest[k, corners[f, c]])
         touching, area = 0.0, 0.0
         for p in range(first[k] + f * each, first[k] + (f + 1) * each):
-            touching, area = touching + weights[p] * found[p, column], area + weights[p]
+            touching, area = touching + weights[p] * found[p, _column(form, k, settled)], area + weights[p]
         earnest = min(touching / (EARNEST * area), 1.0)
         for c in range(4):
             i = corners[f, c]

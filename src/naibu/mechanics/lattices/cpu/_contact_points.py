@@ -1,13 +1,14 @@
 """Contact at the quadrature points of faces: pressure of the foundation, friction, their linearization, and what a step leaves behind.
 
-A point stands for a cell of its face, over which the gap changes by its slope; W is the mean depth of the part of the cell that the
-indenter covers, its fraction c. The foundation of the cell is compressed by ``dw = W - w0`` in a step. With the multiplier p' of the
-nodes at the end of the step before the pressure is ``p = max(0, a dw + b y0 + c p')``: an augmented Lagrangian :cite:p:`simo1992` whose
-multiplier lives at the nodes, as far as the indenter covers what lies around them. An indenter that is large beside the faces thus leaves
-hardly any penetration; to a small one the foundation yields, as the solid does between the nodes. Friction follows by a return mapping of
-``t0 - k_t h (slip velocity)`` to ``|t| <= mu p``. In a pass, points in contact have the pressure and the friction that are linear in the
-velocity, the latter with the ratio of the return mapping of the pass before: the matrix stays symmetric and positive, and no friction
-turns a point round.
+A point stands for a cell of its face, over which the gap changes by its slope; W(d) is the mean depth of the part of the cell that the
+indenter covers where it is d deep in its middle. The foundation of the cell is compressed by ``dw = W - w0`` in a step. With the
+multiplier p' of the nodes at the end of the step before the pressure is ``p = max(0, a (W(d + p' / a) - w0) + b y0)``, which is
+``a dw + b y0 + p'`` where all of the cell is covered, and falls steadily to nothing as the indenter leaves: an augmented Lagrangian
+:cite:p:`simo1992` whose multiplier lives at the nodes, as far as the indenter covers what lies around them. An indenter that is large
+beside the faces thus leaves hardly any penetration; to a small one the foundation yields, as the solid does between the nodes. Friction
+follows by a return mapping of ``t0 - k_t h (slip velocity)`` to ``|t| <= mu p``. In a pass, points in contact have the pressure and the
+friction that are linear in the velocity, the latter with the ratio of the return mapping of the pass before: the matrix stays symmetric
+and positive, and no friction turns a point round.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ MARGIN = 0.25  # of the radius of a face, by which it may be off what was forese
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
 LEAST_SLOPE = 1e-3  # of a gap over a cell
+LEAST_FACING = 0.01
 NEAR = 0.1  # of the width of a cell that looks at a flat indenter: it has what is as near as that
 UPRIGHT = 0.75  # width of the cells of a face that stands upright on an indenter: Gauss points lie nearer to its edge than they are wide
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
@@ -176,31 +178,33 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
                 gap = _primitive_gap(kind, size, turn, d, q, m, n, none)
             if begins:
                 linear[p, ACTIVE] = 0.0
+            carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
             if linear[p, ACTIVE] == 0.0:
                 if found[p, TOUCHING] != 0.0:
                     found[p] = 0.0
-                if _is_far(gap, np.sqrt(weight), form[k, 0]):
+                if _is_far(gap - carried / stiff, np.sqrt(weight), form[k, 0]):
                     found[p, UNDER] = 0.0
                     continue
             own, result = linear[p], found[p]
             _combine(shape, speed, slip)
             exerted(own, slip, result)
             slope = _slope(n, across)
-            carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
             _towards_face(n, across)
-            depth, covered, growth = _covered(-gap, slope, np.sqrt(weight), form[k, 0])
+            facing = _facing(slope, form[k, 0])
+            depth, kept, steep = _pressed(-gap, slope, np.sqrt(weight), form[k, 0], facing * carried / stiff)
+            kept *= facing
             if form[k, 0] == 0.0:
                 found[p, UNDER] = _covered(NEAR * (1.0 - slope) * np.sqrt(weight) - gap, slope, np.sqrt(weight), 0.0)[1]
-            hard = HARD * stiff if covered > 0.0 and depth > form[k, 1] else 0.0
-            own_pressure = stiff * (depth - compression[p]) + spring * extension[p] + covered * carried
-            pressure = own_pressure + hard * max(depth - form[k, 1], 0.0) if covered > 0.0 else 0.0
+            hard = HARD * stiff if depth > form[k, 1] else 0.0
+            own_pressure = stiff * (depth - compression[p]) + spring * extension[p] + kept * carried
+            pressure = own_pressure + hard * max(depth - form[k, 1], 0.0) if kept > 0.0 else 0.0
             wrong += weight * abs(max(pressure, 0.0) - result[ALONG])
-            own[ACTIVE] = covered if pressure > 0.0 else 0.0
+            own[ACTIVE] = kept if pressure > 0.0 else 0.0
             if pressure <= 0.0:
                 continue
             total += weight * pressure
             away = _open(own, n, motion, k, d, slip)
-            own[STIFF] = step * ((stiff + hard) * covered + growth * carried)
+            own[STIFF] = step * (stiff * steep + hard)
             own[PRESSURE] = pressure + own[STIFF] * away
             if friction[k, 0] > 0.0:
                 drag = step * TANGENTIAL * foundation[f, 0]
@@ -250,15 +254,38 @@ def _towards_face(n, across):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 @njit(cache=True)
 def _covered(depth, slope, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return mean depth and covered fraction of a cell, and how fast the fraction grows with the depth at its middle."""
+    """Return mean depth and covered fraction of a cell."""
     width *= 1.0 - (1.0 - UPRIGHT) * min(max((slope - 0.7) / 0.3, 0.0), 1.0)
     half = 0.5 * width * (slope + 0.25 * width * curvature + LEAST_SLOPE)
     depth -= 0.5 * width * LEAST_SLOPE  # nothing where a flat indenter just touches
     if depth >= half:
-        return depth, 1.0, 0.0
+        return depth, 1.0
     if depth <= -half:
-        return 0.0, 0.0, 0.0
-    return (depth + half) ** 2 / (4.0 * half), (depth + half) / (2.0 * half), 0.5 / half
+        return 0.0, 0.0
+    return (depth + half) ** 2 / (4.0 * half), (depth + half) / (2.0 * half)
+
+
+@njit(cache=True)
+def _facing(slope, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the fraction of its multiplier that a face bears: hardly any where it stands upright on a flat indenter.
+
+    Nodes at an edge have one multiplier for both sides of the edge, and what presses one side does not press the other.
+    """
+    return 1.0 if curvature > 0.0 else min(max((1.0 - slope) / 0.3, LEAST_FACING), 1.0)
+
+
+@njit(cache=True)
+def _pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return mean depth of a cell, the fraction of its multiplier that it exerts, and how fast its pressure grows with the depth.
+
+    The latter is relative to the foundation. Wherever the indenter is nearer than `reach`, the multiplier over the stiffness of the
+    foundation, the sum of both presses: it falls steadily to nothing as the indenter leaves, and derives from a convex potential.
+    """
+    mean, covered = _covered(depth, slope, width, curvature)
+    if reach <= 0.0:
+        return mean, covered, covered
+    whole, steep = _covered(depth + reach, slope, width, curvature)
+    return mean, (whole - mean) / reach, steep
 
 
 @njit(cache=True)
@@ -290,11 +317,12 @@ def rest_at(x, indenters, surface, begun, history):  # type: ignore[no-untyped-d
                     continue
                 _combine(shapes[rule[k] + g], at, d)
                 gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
-                depth, covered, _ = _covered(-gap, _slope(n, across), np.sqrt(weights[p]), form[k, 0])
-                carried = 0.0
+                reach = 0.0
                 for c in range(4):
-                    carried += shapes[rule[k] + g, c] * multiplier[k, corners[f, c]]
-                compression[p] = depth + covered * carried * thickness[k, f] / foundation[f, 0]
+                    reach += shapes[rule[k] + g, c] * multiplier[k, corners[f, c]] * thickness[k, f] / foundation[f, 0]
+                slope = _slope(n, across)
+                reach *= _facing(slope, form[k, 0])
+                compression[p] = _covered(reach - gap, slope, np.sqrt(weights[p]), form[k, 0])[0]
 
 
 @njit(cache=True)
