@@ -23,7 +23,7 @@ DEFAULTS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SI
 PATIENCE_S = 0.7  # after a signal, before a process that is still compiling is ended
 # seconds to compile all kernels of a verb, on two cores; what is there already, or shared with other verbs, takes none
 SECONDS = {
-    "identify": 40, "demo": 40, "predict": 40, "compare": 40, "sense": 60, "compare-methods": 120, "track": 30, "simulate": 60, "live": 100,
+    "identify": 40, "demo": 40, "predict": 40, "compare": 40, "sense": 20, "compare-methods": 120, "track": 30, "simulate": 35, "live": 100,
 }  # fmt: skip
 USUAL_S = 40
 

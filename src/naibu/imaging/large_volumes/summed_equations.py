@@ -282,7 +282,8 @@ class SummedEquations:
         for inclusion in coarse.inclusions:
             inclusion.hold(fit)
         dilatation = coarse.dilatation * system.gauss_volume
-        right = system.assembled(coarse.c, fit.products, fit.force, coarse.bending, dilatation, sums.matrix)
+        own = bool(coarse.inclusions)  # all other voxels are in the sums
+        right = system.assembled(coarse.c, fit.products, fit.force, coarse.bending, dilatation, sums.matrix, voxels=own)
         gone = np.zeros((system.n + 1, 3), np.float32)
         gone[:-1] = (coarse.c - about)[system.active]
         back = np.empty((system.n, 3), np.float32)

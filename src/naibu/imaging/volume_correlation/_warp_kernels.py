@@ -283,7 +283,8 @@ def gain_normal_equations(
     """
     parts = len(left)
     for t in prange(parts):
-        sums, i, y, z = np.zeros(13), 0, F(0), F(0)
+        # not a literal, for which `_add_line` would be compiled once more
+        sums, i, y, z = np.zeros(13), np.int64(0), F(0), F(0)
         for p in range(t * len(intensity) // parts, (t + 1) * len(intensity) // parts):
             if value[p] < F(0.9 * OUTSIDE) or weight[p] <= 0:
                 continue

@@ -27,7 +27,7 @@ def products_of_many(big: AnyArray, neighbours: AnyArray, x: AnyArray, y: AnyArr
     for t in prange(CHUNKS):
         for p in range(t * n // CHUNKS, (t + 1) * n // CHUNKS):
             sums = y[p].reshape(3 * samples)
-            first = 0
+            first = np.int64(0)
             while first + 2 * WIDTH <= samples:
                 _two_columns(big[p], neighbours[p], flat, samples, first, sums)
                 first += 2 * WIDTH

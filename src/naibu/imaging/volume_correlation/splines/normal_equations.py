@@ -159,17 +159,20 @@ class SplineSystem:
         bending: FloatArray,
         dilatation: FloatArray,
         given: Float32Array | None = None,
+        *,
+        voxels: bool = True,
     ) -> Float32Array:
         """Assemble the matrix, and return the right side (n, 3), at coefficients c; bending (m, 3) and dilatation (m,) are weights.
 
-        To the matrix one that is given (n, 3, 1029) is added.
+        To the matrix one that is given (n, 3, 1029) is added; without `voxels`, only the penalties are.
         """
+        number = self.level.number if voxels else np.full_like(self.level.number, -1)
         self.matrix[:] = 0 if given is None else given
         self._inverse = None
         right = np.zeros((self.n, 3), np.float32)
         self.bending_energy[:], self.dilatation_energy[:] = 0, 0
         assemble(
-            self.matrix, right, self.tasks, self.cells, self.slot, c.astype(np.float32), products, force, self.level.number, self.starts,
+            self.matrix, right, self.tasks, self.cells, self.slot, c.astype(np.float32), products, force, number, self.starts,
             self.along, self.weights, bending.astype(np.float32), self.stiffness, dilatation.astype(np.float32), self.gauss, self.ratio,
             self.pairs, self.bending_energy, self.dilatation_energy,
         )  # fmt: skip
