@@ -85,3 +85,19 @@ def test_blocks_of_nodes_take_fewer_iterations_than_nodes(system: SplineSystem) 
         z = np.einsum("nij,nj->ni", alone, r.reshape(-1, 3)).ravel()
         p, rz = z + (r @ z) / rz * p, r @ z
     assert system.solved(b.reshape(-1, 3).astype(np.float32), 1e-2, 400)[1] < 0.75 * steps
+
+
+def test_penalties_alone_are_added_to_a_matrix_that_is_given(system: SplineSystem) -> None:
+    """The matrix is the sum of that of the intensities and that of the penalties; without voxels their forces load nothing."""
+    parts, rng, m = SplineSystem(system.level, system.grid), np.random.default_rng(4), len(system.cells)
+    n = len(system.level.intensity)
+    products, force = rng.random((n, 6)).astype(np.float32), rng.standard_normal((n, 3)).astype(np.float32)
+    c, weights = 0.1 * rng.standard_normal((*system.grid.shape, 3)), (rng.random((m, 3)), STIFF * system.gauss_volume)
+    load = parts.assembled(c, products, force, *weights)
+    whole = parts.matrix.copy()
+    parts.sum_intensities(products)
+    intensities = parts.matrix.copy()
+    alone = parts.assembled(c, products, force, *weights, intensities, voxels=False)
+    np.testing.assert_allclose(parts.matrix, whole, atol=1e-5 * np.abs(whole).max())
+    pulled = parts.force_loads(force[:, :, None])[:, :, 0]
+    np.testing.assert_allclose(alone + pulled, load, atol=1e-5 * np.abs(load).max())
