@@ -122,6 +122,26 @@ def test_records_that_point_the_other_way_are_refused(inputs: tuple[Path, Path, 
     assert not list((tmp_path / "out").glob("*"))
 
 
+@pytest.mark.parametrize(
+    ("factor", "unit", "told"), [(1e-3, "mm", "unit were 1000 times"), (1e3, "mm", "unit were 0.001 times"), (1e3, "m", "x_mm")]
+)
+def test_points_whose_columns_name_another_unit_are_told(
+    inputs: tuple[Path, Path, Path], tmp_path: Path, factor: float, unit: str, told: str
+) -> None:
+    study, cloud, sensor = inputs
+    rows = [row.split(",") for row in cloud.read_text(encoding="utf-8").splitlines()[1:]]
+    lines = "".join(",".join([t, *(f"{factor * float(x):.9g}" for x in place)]) + "\n" for t, *place in rows)
+    cloud.write_text(f"time_s,x_{unit},y_{unit},z_{unit}\n{lines}", encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        calibrate_study(study, shapes=[cloud], forces=[sensor], out=tmp_path / "out", groups="all")
+
+
+def test_a_record_of_a_body_that_is_not_there_is_told(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, cloud, sensor = inputs
+    with pytest.raises(InputError, match=r"of 'punch', which .* has not: its bodies are floor, stamp; correct"):
+        calibrate_study(study, shapes=[cloud], forces=[f"punch={sensor}"], out=tmp_path / "out", groups="all")
+
+
 @pytest.mark.parametrize("method", ["cma-es", "genetic"])
 def test_searches_without_derivatives_go_by_their_seed(inputs: tuple[Path, Path, Path], tmp_path: Path, method: str) -> None:
     pytest.importorskip("cma" if method == "cma-es" else "pymoo")

@@ -19,6 +19,7 @@ from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
 
 WINDOW_S = 0.02
 ROUGHNESS = 2e-5  # of chi-squared in contact
+FEW, TIMES_OFF = 10, 30.0  # points that tell an extent, and by how many times it may differ from that of the object
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +181,7 @@ class StudyProblem:
         Raises
         ------
         InputError
-            Neither points nor forces, points far away from the object, or what `StudyModel.of` refuses.
+            Neither points nor forces, points far away from the object or in another unit, or what `StudyModel.of` refuses.
         """
         require_positive(point_sd_mm, "point_sd_mm", "mm")
         study = unknowns.study
@@ -191,6 +192,7 @@ class StudyProblem:
         clouds = []
         for time, points in captures:
             cloud = checked_points(points, f"points captured at {time:g} s")
+            _check_size(time, cloud, reach)
             far = np.abs(closest_points(cloud, hull, lattice.points).signed)
             if len(far) and far.max() > reach:
                 raise InputError(
@@ -238,3 +240,15 @@ class StudyProblem:
         each = np.broadcast_to(sd[:, :, None], counted.shape)[counted]
         slopes = np.stack([change[counted] for change in found.force_change], axis=1) if p else np.zeros((int(counted.sum()), 0))
         return (found.force[counted] - forces.force[counted]) / each, slopes / each[:, None]
+
+
+def _check_size(time: float, cloud: FloatArray, reach: float) -> None:
+    """Refuse points whose extent says that their unit is not the one that is named: they are many, and far from as large as the object."""
+    extent = float(np.linalg.norm(np.ptp(cloud, axis=0))) if len(cloud) >= FEW else reach
+    if not reach / TIMES_OFF < extent < TIMES_OFF * reach:
+        factor = 10.0 ** round(np.log10(reach / extent)) if extent > 0.0 else 0.0
+        told = f", as if their unit were {factor:g} times the one that is named" if factor else ""
+        raise InputError(
+            f"the {len(cloud)} points of {time:g} s extend over {extent:.4g} mm, the object of the study over {reach:.4g} mm{told}: "
+            "name the unit in the columns, as in x_m or x_mm, or correct size_mm of the study"
+        )

@@ -111,6 +111,6 @@ def _checked(path: Path, points: FloatArray) -> FloatArray:
     if bad.any():
         raise InputError(
             f"{path}: point {int(np.argmax(bad)) + 1} is at {points[bad][0].tolist()} mm; coordinates are finite and at most "
-            f"{LENGTHS_MM[1]:g} mm"
+            f"{LENGTHS_MM[1]:g} mm; if their unit is another one than the columns say, rename these, as in x_mm"
         )
     return points

@@ -217,7 +217,10 @@ def _problem(
                 "NAME=FILE, or add a column 'indenter'"
             )
         if record.indenter and record.indenter not in names:
-            raise InputError(f"forces: there is no indenter {record.indenter!r} in the study; there are {', '.join(names)}")
+            raise InputError(
+                f"forces: a record is of {record.indenter!r}, which {prepared.source} has not: its bodies are {', '.join(names)}; correct "
+                "the column 'indenter', or NAME in NAME=FILE"
+            )
         placed.append((names.index(record.indenter) if record.indenter else movable[0], record.times_s, record.force))
     recorded = RecordedForces.of(study, placed, sd_mn=force_sd_mn)
     return StudyProblem.of(unknowns, [(c.time_s, c.points) for c in captured], recorded, point_sd_mm=point_sd_mm)

@@ -190,9 +190,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             exerted(own, slip, result)
             slope = _slope(n, across)
             _towards_face(n, across)
-            facing = _facing(slope, form[k, 0])
-            depth, kept, steep = _pressed(-gap, slope, np.sqrt(weight), form[k, 0], facing * carried / stiff)
-            kept *= facing
+            depth, kept, steep = _pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff)
             if form[k, 0] == 0.0:
                 found[p, UNDER] = _covered(NEAR * (1.0 - slope) * np.sqrt(weight) - gap, slope, np.sqrt(weight), 0.0)[1]
             hard = HARD * stiff if depth > form[k, 1] else 0.0
@@ -282,9 +280,10 @@ def _pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-
     foundation, the sum of both presses: it falls steadily to nothing as the indenter leaves, and derives from a convex potential.
     """
     mean, covered = _covered(depth, slope, width, curvature)
+    facing = _facing(slope, curvature)
     if reach <= 0.0:
-        return mean, covered, covered
-    whole, steep = _covered(depth + reach, slope, width, curvature)
+        return mean, facing * covered, covered
+    whole, steep = _covered(depth + facing * reach, slope, width, curvature)
     return mean, (whole - mean) / reach, steep
 
 
