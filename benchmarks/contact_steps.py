@@ -3,10 +3,10 @@
 A cube of dough of 80 mm on a held floor; a sphere goes down into it and then to and fro, with friction, in a session of steps of 1 ms that
 are called one by one. Percentiles are over single steps, beside those of the same lattice without a sphere; `cpu` is the time of the
 processor, `wall` that of the clock, which on a shared machine counts what others do. The curves are those of a sphere that goes 5 mm deep
-in 1 s, at several places over a face of 9^3 nodes: the largest change of the force in one of 250 steps, and the largest difference from
-17^3 nodes, as fractions of the range; the force of the first step, which is that of the dashpots, is told by itself. With a given
-pressure (Hertz's, of several radii) in place of a sphere there is no contact to be found: how much the two lattices differ then is due to
-the lattices alone, and how much they differ with the foundations of the contact shows what these make up for.
+in 1 s, at several places over a face of 9^3 nodes, and with several radii: the largest change of the force in one of 250 steps, and the
+largest difference from 17^3 nodes, as fractions of the range; the force of the first step, which is that of the dashpots, is told by
+itself. With a given pressure (Hertz's, of several radii) in place of a sphere there is no contact to be found: how much the two lattices
+differ then is due to the lattices alone, and how much they differ with the foundations of the contact shows what these make up for.
 
 Run: ``OMP_NUM_THREADS=1 python benchmarks/contact_steps.py [--sizes 8,16] [--steps 1500] [--curves] [--given]``.
 """
@@ -30,6 +30,7 @@ from naibu.mechanics.lattices.model.state import ConstrainedNodes
 SIDE_MM, MASS_KG, STEP_S = 80.0, 0.63, 1e-3
 CLASSES = ("short", "normal", "long")
 PLACES = (("node", (40.0, 40.0)), ("edge", (40.0, 45.0)), ("quarter", (42.5, 42.5)), ("middle", (45.0, 45.0)))
+PLACES += tuple((f"{x}, {y}", (x, y)) for x, y in ((41.3, 43.7), (43.3, 46.1), (44.0, 42.0)))
 DOUGH = ((60.0, 40.0, 25.0), (30.0, 18.0, 12.0), (2000.0, 1500.0, 1000.0))  # of the bundled studies, at a spacing of 10 mm
 
 
@@ -92,19 +93,19 @@ def curve(n: int, radius: float, place: tuple[float, float], steps: int = 250) -
 
 def curves() -> None:
     print("force of a sphere that goes 5 mm deep: largest step, and difference from a mesh twice as fine, % of the range")
-    for radius in (10.0, 5.0):
-        for name, place in PLACES:
+    for radius in (10.0, 5.0, 7.0, 15.0, 25.0):
+        for name, place in PLACES if radius <= 10.0 else PLACES[:4]:
             coarse, fine = curve(8, radius, place), curve(16, radius, place)
             step, apart = np.abs(np.diff(coarse)).max() / np.ptp(coarse), (coarse - fine) / np.ptp(fine)
             between = f"{100 * apart.min():6.2f} .. {100 * apart.max():5.2f}   first step {100 * coarse[0] / np.ptp(coarse):5.2f}"
-            print(f"  radius {radius:4g} mm over {name:8s} step {100 * step:5.2f}   difference {between}", flush=True)
+            print(f"  radius {radius:4g} mm over {name:10s} step {100 * step:5.2f}   difference {between}", flush=True)
 
 
 def given() -> None:
     """Print how much less 9^3 nodes yield to a given pressure than 17^3, without and with the foundations."""
     print("yield of 9^3 nodes to Hertz's pressure, % from that of 17^3: lattices alone, and with their foundations")
     bodies = [(n, *_elastic(n)) for n in (8, 16)]
-    for name, place in PLACES:
+    for name, place in PLACES[:4]:
         row = []
         for radius in (3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0):
             alone, standing = np.array([_yields(n, inverse, stiffness, place, radius) for n, inverse, stiffness in bodies]).T

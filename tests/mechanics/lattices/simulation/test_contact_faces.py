@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from naibu.core.arrays import FloatArray
+from naibu.mechanics.contact.contact_surfaces import face_quadrature
 from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import (
     RigidIndenter,
@@ -19,6 +20,7 @@ from naibu.mechanics.contact.rigid_indenters import (
     plane_indenter,
     spherical_indenter,
 )
+from naibu.mechanics.lattices.cpu._contact_points import _covered
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import CLASSES, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
@@ -54,7 +56,28 @@ def test_a_sphere_meets_a_smooth_force_that_a_finer_mesh_confirms(place: tuple[f
     curves = [pushed(dough(nodes), spherical_indenter((*place, SIDE_MM + 10.0), 10.0), 5.0, 250) for nodes in (9, 17)]
     for curve in curves:
         assert np.abs(np.diff(curve)).max() < 0.02 * np.ptp(curve)
+        assert 0.01 * np.ptp(curve) < curve[0] < 0.035 * np.ptp(curve)  # the dashpots of a half-space resist the first touch by 2.6 %
     assert np.abs(curves[0] - curves[1]).max() < 0.03 * np.ptp(curves[1])
+
+
+@pytest.mark.parametrize(
+    ("order", "depth", "within"), [(5, 0.1, 0.5), (5, 0.3, 0.2), (5, 1.0, 0.06), (5, 3.0, 0.03), (3, 1.0, 0.15), (3, 3.0, 0.06)]
+)
+def test_cells_of_faces_add_up_to_the_volume_of_the_cap_that_a_sphere_has_below_them(order: int, depth: float, within: float) -> None:
+    """Integral of ``R - r`` over the section of a sphere whose centre is R - d above a plane, wherever it stands over its faces."""
+    radius, edge = 10.0, 10.0
+    grid = np.arange(-1.0, 3.0) * edge
+    points = np.stack([*np.meshgrid(grid, grid, indexing="ij"), np.zeros((4, 4))], axis=2).reshape(-1, 3)
+    corner = (4 * np.arange(3)[:, None] + np.arange(3)).ravel()
+    faces = np.stack([corner, corner + 4, corner + 5, corner + 1], axis=1)
+    shape, weight = face_quadrature(points, faces, order)
+    at, height = np.einsum("qk,fki->fqi", shape, points[faces]).reshape(-1, 3), radius - depth
+    exact = np.pi * radius * (radius**2 - height**2) - 2.0 * np.pi / 3.0 * (radius**3 - height**3)
+    for place in np.random.default_rng(2).uniform(0.0, edge, (20, 2)):
+        away = np.linalg.norm(at - [*place, height], axis=1)
+        slope = np.linalg.norm(at[:, :2] - place, axis=1) / away
+        mean = [_covered(d, s, np.sqrt(w), 1.0 / radius)[0] for d, s, w in zip(radius - away, slope, weight.ravel(), strict=True)]
+        assert weight.ravel() @ mean == pytest.approx(exact, rel=within)
 
 
 def test_a_plate_presses_as_nodes_that_move_with_it() -> None:

@@ -26,6 +26,9 @@ HARD = 20.0  # how many times the foundation is stiffer where an indenter is dee
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
 LEAST_SLOPE = 1e-3  # of a gap over a cell
 LEAST_FACING = 0.01
+# of the width of a cell times what the slope changes by over it: mean gap over that at the point, beside the lowest point of an indenter;
+# and by how much earlier a cell begins to be covered than it is, so that it is not so at once
+BESIDE, EARLY = 1.0 / 24.0, 1.0 / 16.0
 NEAR = 0.1  # of the width of a cell that looks at a flat indenter: it has what is as near as that
 UPRIGHT = 0.75  # width of the cells of a face that stands upright on an indenter: Gauss points lie nearer to its edge than they are wide
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
@@ -252,10 +255,18 @@ def _towards_face(n, across):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 @njit(cache=True)
 def _covered(depth, slope, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return mean depth and covered fraction of a cell."""
+    """Return mean depth and covered fraction of a cell.
+
+    Depths are taken to be spread evenly over a cell, from what is nearest to the indenter: the lowest point of a sphere where that is
+    within the cell, else its corner. A disc as large as the cell has the mean depth under a sphere's lowest point exactly so; elsewhere
+    Gauss's rule integrates a part of the curvature itself.
+    """
     width *= 1.0 - (1.0 - UPRIGHT) * min(max((slope - 0.7) / 0.3, 0.0), 1.0)
-    half = 0.5 * width * (slope + 0.25 * width * curvature + LEAST_SLOPE)
-    depth -= 0.5 * width * LEAST_SLOPE  # nothing where a flat indenter just touches
+    bend = width * curvature  # what the slope changes by over the cell
+    nearer = 0.5 * slope**2 / curvature if slope < 0.5 * bend else width * (0.5 * slope - 0.125 * bend)
+    mean = width * bend * (BESIDE + (0.25 / np.pi - BESIDE) * max(0.0, 1.0 - slope / max(bend, 1e-300)))
+    half = nearer + mean + EARLY * width * bend + 0.5 * width * LEAST_SLOPE
+    depth -= mean + 0.5 * width * LEAST_SLOPE  # nothing where a flat indenter just touches
     if depth >= half:
         return depth, 1.0
     if depth <= -half:
