@@ -15,6 +15,7 @@ from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.verdict import Explanation
+from naibu.meshing.surface import boundary_faces
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
 
 PUSH = (0.0, 0.0, -4.0)
@@ -51,6 +52,20 @@ def test_the_modulus_is_found_on_coarse_hexahedra_and_the_elements_are_in_the_in
     assert found.mesh_shift is not None and found.budget is not None and found.verdict is not None
     assert 0.02 < found.mesh_shift[0] < 0.10 and found.budget.mesh[0] > 0.2 * found.mesh_shift[0]
     assert found.verdict.explanation is Explanation.EXPLAINED and found.budget.shared == 1.0
+
+
+@pytest.mark.parametrize(("name", "cells"), [("cube", 6), ("tapered", 8)])
+def test_intervals_hold_the_modulus_where_the_motion_of_the_whole_surface_is_sought(name: str, cells: int) -> None:
+    """Exact displacements at many points: half the size of elements, with the surface as it is, hardly tells what elements cost."""
+    body, truth = solved(name)
+    points, u = truth.at(np.random.default_rng(0).uniform(0.02, 0.98, (2500, 3)))
+    mesh, _ = body.model(cells, "hexahedron")
+    on_surface = np.isin(np.arange(mesh.n_points), boundary_faces(mesh).faces)
+    case = FieldLoadCase.of("push", DisplacementField.from_arrays(points, u, sd_mm=0.2 * SD_MM), mesh, loaded=on_surface)
+    found = identify_field(mesh, [case], Zones.of(mesh, known={"known": body.known}))
+    (young,), (poisson,) = found.intervals()
+    assert young[0] < 5.0 < young[1] and young[1] / young[0] < 1.25
+    assert poisson[0] < 0.45 < poisson[1]
 
 
 def test_tetrahedra_are_made_quadratic() -> None:

@@ -360,6 +360,16 @@ def test_a_map_that_no_regions_explain_says_so_first(folder: Path, monkeypatch: 
     assert 0.4 < above < 0.6
 
 
+def test_a_surface_that_noise_folds_is_told_as_such(folder: Path) -> None:
+    """Noise of 3 mm that is not stated, in cubes of 4 mm: advice to refine them and to round off an indenter would mislead."""
+    field = read_field(folder / "field.h5")
+    noise = 3.0 * np.random.default_rng(5).standard_normal(field.vectors.shape)
+    write_field(folder / "noisy.h5", DisplacementField.from_arrays(field.points, field.vectors + noise))
+    with pytest.raises(ConvergenceError, match=r"errors of the measurement there are too large.* Use larger elements") as told:
+        identify_fields(folder / "noisy.h5", zones=folder / "labels.mha", known=["label 2=10 kPa, 0.4"], element_size_mm=4.0)
+    assert "indenter" not in str(told.value)
+
+
 def test_a_map_whose_regions_find_no_equilibrium_is_the_result(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The map that was found before is not lost, as it was, to an error."""
 

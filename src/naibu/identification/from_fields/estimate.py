@@ -389,7 +389,7 @@ class _Recipe:
             sure = on_mesh.standard_deviations() < DETERMINED
             if corrected is None:
                 layers, apart = np.isin(names, thin) if thin else None, np.isin(names, judged.mesh_dependent)
-                change, mixed = relative_change(shift), self.region_at is not None or not alike
+                change, mixed = relative_change(shift), self.region_at is not None or not alike or model.surface_sought
                 covariance = doubt_in_all(change, sure, quadratic.hessian, apart, mixed=mixed, thin=layers)
                 coarse = bool(thin) or float(np.abs(change[sure]).max(initial=0.0)) > COARSE
             else:

@@ -111,10 +111,11 @@ def doubt_of(
 
     Those of ln(kappa / mu) are relative to mu / kappa on the mesh (see `relative_change` and `stretch_of`).
     The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left. Where zones
-    end inside of cells, or the change is that of another law (`mixed`), it has no order of convergence: what is left may be as large as the
-    change to half the size. If regions are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that
-    are, for less than `ITSELF` times as much. Logarithms that the measurement does not determine move at no cost to the fit, and tell
-    nothing of others: only those that are `sure` (2 count,) count as the worst, and each gets at least the doubt of its own change.
+    end inside of cells, the change is that of another law, or the motion of the whole surface is sought, which elements of half the size
+    would find otherwise (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size. If regions
+    are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than `ITSELF` times as
+    much. Logarithms that the measurement does not determine move at no cost to the fit, and tell nothing of others: only those that are
+    `sure` (2 count,) count as the worst, and each gets at least the doubt of its own change.
     """
     told = np.abs(shift) if sure is None else np.abs(shift[sure])
     worst = max(float(told.max(initial=0.0)), 0.0 if thin is None else THIN)

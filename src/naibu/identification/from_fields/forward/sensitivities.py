@@ -26,6 +26,7 @@ from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoad
 from naibu.identification.from_fields.forward.loaded_components import BLOCK, BoundaryPreconditioner, alike, conjugate_gradients
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
+from naibu.meshing.surface import boundary_faces
 
 REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
 OUTDATED = (
@@ -99,6 +100,14 @@ class FieldModel:
     def points(self) -> FloatArray:
         """Nodes (n, d), mm, on which equilibrium is computed."""
         return self.computed.points
+
+    @property
+    def surface_sought(self) -> bool:
+        """Whether forces may act on the whole surface of a body in space, whose motion is sought, in a load case."""
+        if self.mesh.dimension != 3:
+            return False
+        surface = np.unique(boundary_faces(self.mesh).faces)
+        return any(bool(o.load_case.loaded[surface].all()) for o in self.observed)
 
     @property
     def n_data(self) -> int:

@@ -26,6 +26,12 @@ NEGLIGIBLE = 1e-9  # by how much a step must promise to lower half of chi square
 ANCHOR = 1e-9  # of the Hessian's largest diagonal entry, on every modulus: what neither data nor penalty determine stays where it is
 
 
+CANNOT_FOLLOW = (
+    "no body of finite strain follows the motion of the surface that the measurement tells: errors of the measurement there are too large "
+    "a part of the strain in an element. Use larger elements, leave doubtful measurements out, or end the object a little further inside."
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Bounds:
     """Bounds of the moduli of all zones.
@@ -165,7 +171,12 @@ def first_point(model: FieldModel, theta: FloatArray) -> Point:
     states = [u + du.reshape(u.shape) for u, du in zip(at.point.states, moved, strict=True)]
     if small is not model:  # what preconditions small strain does so at finite strain, and took longer to make than all else here
         model.boundary[:], model.informed[:] = small.boundary, small.informed
-    return model.evaluate(theta, states if model.law.linear else model.from_rest(theta, states))
+    if model.law.linear:
+        return model.evaluate(theta, states)
+    try:
+        return model.evaluate(theta, model.from_rest(theta, states))
+    except ConvergenceError as error:
+        raise ConvergenceError(f"{CANNOT_FOLLOW} ({str(error).partition('. ')[0]})") from error
 
 
 def exact_step(at: Linearised, objective: Objective) -> Step:
