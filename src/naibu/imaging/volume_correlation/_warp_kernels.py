@@ -249,7 +249,10 @@ def gain_normal_equations(
     left: AnyArray,
     right: AnyArray,
 ) -> None:
-    """Add the normal equations of ``intensity = gain value + offset``, trilinear on a lattice, to left and right, one for each thread."""
+    """Add the normal equations of ``intensity = gain value + offset``, trilinear on a lattice, to left and right, one for each thread.
+
+    left (t, 2 k, 2 k) is their matrix; right (t, k, 3) sums of value times intensity, intensity, and squared intensity.
+    """
     parts = len(left)
     for t in prange(parts):
         ids, w8 = np.empty(8, np.int64), np.empty(8)
@@ -259,9 +262,10 @@ def gain_normal_equations(
             _corners(index[p, 0], index[p, 1], index[p, 2], low, step, n, ids, w8)
             g = float(value[p])
             for q in range(8):
-                a, wq = 2 * ids[q], weight[p] * w8[q]
-                right[t, a] += wq * g * intensity[p]
-                right[t, a + 1] += wq * intensity[p]
+                a, wq, f = 2 * ids[q], weight[p] * w8[q], float(intensity[p])
+                right[t, ids[q], 0] += wq * g * f
+                right[t, ids[q], 1] += wq * f
+                right[t, ids[q], 2] += wq * f * f
                 for r in range(8):
                     b, v = 2 * ids[r], wq * w8[r]
                     left[t, a, b] += v * g * g
