@@ -32,4 +32,6 @@ def test_normal_equations_are_those_of_least_squares() -> None:
     both = np.stack([hats * np.where(seen > 0.0, value, 0.0)[:, None], hats], axis=2).reshape(n, -1)
     matrix, load = lattice.normal_equations(value, weight)
     np.testing.assert_allclose(matrix, both.T @ (seen[:, None] * both), atol=1e-5)
-    np.testing.assert_allclose(load, both.T @ (seen * level.intensity), atol=1e-5)
+    intensity = level.intensity.astype(float)
+    products = np.stack([np.where(seen > 0.0, value, 0.0) * intensity, intensity, intensity**2], axis=1)
+    np.testing.assert_allclose(load, hats.T @ (seen[:, None] * products), atol=1e-5)

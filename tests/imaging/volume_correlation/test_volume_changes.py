@@ -8,8 +8,18 @@ import numpy as np
 import pytest
 
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
+from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
-from naibu.imaging.volume_correlation.results.hidden_dilatation import APART, RADIUS, _displacement, _from_nearest
+from naibu.imaging.volume_correlation.results.hidden_dilatation import (
+    APART,
+    RADIUS,
+    _cell_mm,
+    _displacement,
+    _from_nearest,
+    _swelling,
+    pull_of_parts,
+)
+from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
 from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid
 from naibu.validation.specimens.intruded_body import intruded_body
 from naibu.validation.specimens.swollen_body import MIDDLE_MM, SwollenBody, SwollenSphere, swollen_body
@@ -60,10 +70,10 @@ def test_a_part_that_swells_or_shrinks_is_seen_to(ratio: float) -> None:
 
 @pytest.mark.parametrize("ratio", [1.15, 0.85])
 def test_a_small_part_that_noise_hides_has_wide_regions(ratio: float) -> None:
-    """The noise of this seed takes from what shrinks and adds to what swells: the regions held 17 % of the one, and 100 % of the other."""
+    """A gain that noise had lowered took from what shrinks and added to what swells: 17 % of the one were held, and 100 % of the other."""
     part = SwollenSphere(*SMALL, ratio)
     body, found = measured(SwollenSphere(*LARGE, ratio), part, noise=MUCH_NOISE)
-    assert held(body, found, near(body, part, 1.5)) > 0.5
+    assert held(body, found, near(body, part, 1.5)) > 0.75
     away = ~near(body, part, 2.0) & ~near(body, SwollenSphere(*LARGE, ratio), 1.5) & found.valid & body.mask
     sd = np.sqrt(np.trace(found.covariance_at(np.argwhere(away)[:, ::-1].astype(float)), axis1=1, axis2=2) / 3.0)
     assert np.median(sd) < 0.15  # voxels: what is hidden elsewhere is less
@@ -77,7 +87,7 @@ def test_bending_that_noise_hides_is_held() -> None:
     error = (found.displacement.vectors - body.displacement)[tuple(at.T)]
     covariance = found.covariance_at(at[:, ::-1].astype(float))
     assert (np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]) < CHI_SQUARED_95).mean() > 0.9
-    assert np.median(np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3.0)) < 0.12
+    assert np.median(np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3.0)) < 0.06  # .09 where dilatation alone told what is hidden
 
 
 def test_trial_parts_swell_by_one_and_shrink_by_one_in_a_medium_that_keeps_its_volume() -> None:
@@ -96,6 +106,20 @@ def test_trial_parts_swell_by_one_and_shrink_by_one_in_a_medium_that_keeps_its_v
     assert np.allclose(divergence[clear], expected[clear], atol=1e-5)
 
 
+def test_the_work_on_a_part_is_that_of_its_displacement() -> None:
+    """Sums over the nodes of random forces times the displacement, part by part, in cells that are not cubes."""
+    body = swollen_body((), seed=SEED)
+    mask = body.mask
+    level = ImageLevel(np.asarray(body.before.values), np.asarray(body.after.values), mask, np.array([1.0, 1.3, 0.8]), (1, 1, 1), 0.0)
+    grid = SplineGrid.around([0.0] * 3, np.array(mask.shape[::-1]) * level.spacing, [6.0, 8.0, 5.0])
+    system, rng = SplineSystem(level, grid), np.random.default_rng(0)
+    pull = rng.standard_normal((system.n, 3))
+    work = pull_of_parts(system, pull)
+    for at in [(3, 4, 5), (6, 2, 7)]:
+        arm = (grid.nodes_mm[system.active] - grid.nodes_mm[at]) / _cell_mm(grid)
+        assert work[at] == pytest.approx(float((pull * _swelling(arm)).sum()) * _cell_mm(grid), rel=1e-6, abs=1e-6)
+
+
 def test_where_volume_is_kept_all_cells_have_one_weight() -> None:
     """The body moves rigidly; random fields that were solved to a relative 0.06 held 27 % of it where there was much noise."""
     for noise in (5.0, MUCH_NOISE):
@@ -109,8 +133,11 @@ def test_where_volume_is_kept_all_cells_have_one_weight() -> None:
 
 @pytest.mark.parametrize("ratio", [1.2, 0.8])
 def test_a_body_that_swells_or_shrinks_as_a_whole_is_seen_to(ratio: float) -> None:
+    """All cells held it back by .02 of the volume, and it was off by .09 mm, until the ratio of volumes was that of the body."""
     body, found = measured(SwollenSphere(tuple(MIDDLE_MM), 100.0, ratio), noise=MUCH_NOISE)
-    assert mean_ratio(body, found, body.mask) == pytest.approx(ratio, abs=0.02)
+    assert mean_ratio(body, found, body.mask) == pytest.approx(ratio, abs=0.01)
+    error = np.linalg.norm((found.displacement.vectors - body.displacement)[found.valid & body.mask], axis=1)
+    assert error.mean() < 0.06
     assert held(body, found, body.mask) > 0.95
 
 

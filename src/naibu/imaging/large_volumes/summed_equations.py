@@ -207,7 +207,7 @@ class SummedEquations:
         self._assembled(sums, before)
         scale = lost_to_robustness(*sums.robust)
         noise = np.ascontiguousarray(np.float32(scale) * sums.draws[:, :, :LATE_DRAWS])
-        hidden = coarse.hidden(coarse.tried(sums.matrix), self.system.solved_many(noise, SAMPLE_TOLERANCE)[0])
+        hidden = coarse.hidden(coarse.tried(sums.matrix), self.system.solved_many(noise, SAMPLE_TOLERANCE)[0], scale)
         samples = self._samples(np.float32(scale) * sums.draws, seed=coarse.settings.seed + 1)
         self.system.warped(coarse.c, fit.value, fit.reference_gradient, fit.gradient, fit.displacement)
         model = self._with_intensities(sums)
@@ -262,8 +262,8 @@ class SummedEquations:
 
     def _gain(self, matrix: FloatArray, load: FloatArray, sd: float, everywhere: tuple[float, float, float]) -> FloatArray:
         if not self.fit.settings.gain_cell_mm:
-            return np.tile(everywhere[:2], len(load) // 2)
-        return most_probable_gain(matrix / sd**2, load / sd**2, everywhere)
+            return np.tile(everywhere[:2], len(load))
+        return most_probable_gain(matrix, load, sd**2, everywhere)
 
     def _residual_sd(self, classes: IntArray) -> float:
         """Return the residual SD from the median of the absolute residuals, which are counted in residual SD of the model."""

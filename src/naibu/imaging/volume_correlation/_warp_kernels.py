@@ -239,19 +239,21 @@ def _corners(x: Any, y: Any, z: Any, low: AnyArray, step: AnyArray, n: IntArray,
 
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _add_line(sums: AnyArray, i: int, y: Any, z: Any, low: AnyArray, step: AnyArray, n: IntArray, left: AnyArray, right: AnyArray) -> None:
-    """Add the sums (13,) over voxels of a line in cell i along x to the normal equations, and clear them.
+    """Add the sums (15,) over voxels of a line in cell i along x to the normal equations, and clear them.
 
-    Weighted squares of the value, values, and ones, for the pairs of the two weights along x; then products with the intensity.
+    Weighted squares of the value, values, and ones, for the pairs of the two weights along x; then for each of these weights products of
+    value and intensity, intensities, and their squares.
     """
     py, pz = (y - low[1]) / step[1], (z - low[2]) / step[2]
     j, k = max(min(int(py), n[1] - 2), 0), max(min(int(pz), n[2] - 2), 0)
     fy, fz = py - j, pz - k
     for q in range(4):
         wq = (fy if q & 1 else 1 - fy) * (fz if q >> 1 else 1 - fz)
-        row = 2 * (((k + (q >> 1)) * n[1] + j + (q & 1)) * n[0] + i)
+        node = ((k + (q >> 1)) * n[1] + j + (q & 1)) * n[0] + i
+        row = 2 * node
         for a in range(2):
-            right[row + 2 * a] += wq * sums[9 + 2 * a]
-            right[row + 2 * a + 1] += wq * sums[10 + 2 * a]
+            for b in range(3):
+                right[node + a, b] += wq * sums[9 + 3 * a + b]
             for r in range(4):
                 w = wq * (fy if r & 1 else 1 - fy) * (fz if r >> 1 else 1 - fz)
                 column = 2 * (((k + (r >> 1)) * n[1] + j + (r & 1)) * n[0] + i)
@@ -261,8 +263,8 @@ def _add_line(sums: AnyArray, i: int, y: Any, z: Any, low: AnyArray, step: AnyAr
                     left[row + 2 * a, column + 2 * b + 1] += w * sums[s + 1]
                     left[row + 2 * a + 1, column + 2 * b] += w * sums[s + 1]
                     left[row + 2 * a + 1, column + 2 * b + 1] += w * sums[s + 2]
-    for k in range(13):
-        sums[k] = 0.0
+    for b in range(15):
+        sums[b] = 0.0
 
 
 @njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
@@ -279,12 +281,13 @@ def gain_normal_equations(
 ) -> None:
     """Add the normal equations of ``intensity = gain value + offset``, trilinear on a lattice, to left and right, one for each thread.
 
-    Voxels are listed along lines, over which sums are taken before they go to the corners of a cell of the lattice.
+    Voxels are listed along lines, over which sums are taken before they go to the corners of a cell of the lattice. left (t, 2 k, 2 k) is
+    their matrix; right (t, k, 3) are sums of value times intensity, intensity, and squared intensity.
     """
     parts = len(left)
     for t in prange(parts):
         # not a literal, for which `_add_line` would be compiled once more
-        sums, i, y, z = np.zeros(13), np.int64(0), F(0), F(0)
+        sums, i, y, z = np.zeros(15), np.int64(0), F(0), F(0)
         for p in range(t * len(intensity) // parts, (t + 1) * len(intensity) // parts):
             if value[p] < F(0.9 * OUTSIDE) or weight[p] <= 0:
                 continue
@@ -305,10 +308,13 @@ def gain_normal_equations(
             sums[6] += w11 * g * g
             sums[7] += w11 * g
             sums[8] += w11
-            sums[9] += w0 * g * intensity[p]
-            sums[10] += w0 * intensity[p]
-            sums[11] += w1 * g * intensity[p]
-            sums[12] += w1 * intensity[p]
+            t0, t1 = w0 * intensity[p], w1 * intensity[p]
+            sums[9] += t0 * g
+            sums[10] += t0
+            sums[11] += t0 * intensity[p]
+            sums[12] += t1 * g
+            sums[13] += t1
+            sums[14] += t1 * intensity[p]
         _add_line(sums, i, y, z, low, step, n, left[t], right[t])
 
 

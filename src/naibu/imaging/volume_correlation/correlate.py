@@ -57,6 +57,7 @@ from naibu.imaging.volume_correlation.volume_changes import (
     LATE_DRAWS,
     demanded_dilatation,
     may_swell,
+    ratio_of_all,
     released_weights,
     squared_dilatation,
 )
@@ -375,6 +376,8 @@ class Correlation:
         # what swells bends about it, more than what it shares its weight with
         self.bending = np.where(self.dilating[:, None], np.minimum(self.bending, self.weights(fit.system, 1.0)[0]), self.bending)
         if self.settings.dilatation_penalty:
+            # an object that swells as a whole would be held back by all of its cells
+            fit.system.ratio = ratio_of_all(fit, self.c, self.most_dilatation)
             # never more than assumed: what little volume changes may not be noise alone
             self.common_dilatation = float(np.clip(dilatation, LEAST_WEIGHT * common, self.most_dilatation))
             self.dilatation = np.where(self.dilating, np.minimum(before, self.common_dilatation), self.common_dilatation)
@@ -387,13 +390,15 @@ class Correlation:
         trial = TrialParts.of(self.fit.system)
         return trial, self.fit.system.multiplied(matrix, trial.coefficients)
 
-    def hidden(self, tried: tuple[TrialParts, Float32Array], noise: Float32Array) -> tuple[FloatArray, FloatArray]:
+    def hidden(self, tried: tuple[TrialParts, Float32Array], noise: Float32Array, robust: float) -> tuple[FloatArray, FloatArray]:
         """Return the variances (m,) of `hidden_dilatation`; the equations are assembled at the present weights.
 
-        `tried` is what `tried` returned, and `noise` (n, 3, s) are coefficients of noise alone.
+        `tried` is what `tried` returned, and `noise` (n, 3, s) are coefficients of noise alone; `robust` is that of `hidden_dilatation`.
         """
-        some = (self.fit.system.gauss_volume > 0.0) & (self.kinds < INSIDE_INCLUSION) & (self.dilatation > 0.0)
-        return hidden_dilatation(self.fit, self.c, *tried, noise, some)
+        system = self.fit.system
+        some = (system.gauss_volume > 0.0) & (self.kinds < INSIDE_INCLUSION) & (self.dilatation > 0.0)
+        penalties = system.bending_load(self.c, self.bending) + system.dilatation_load(self.c, self.dilatation * system.gauss_volume)
+        return hidden_dilatation(self.fit, self.c, *tried, noise, some, -penalties, robust)
 
     def depth_mm(self, level: ImageLevel) -> Float32Array:
         """Return the distance (n,) of the listed voxels of the finest level from the surface, mm; the ends of the volume are none."""
@@ -421,7 +426,7 @@ class Correlation:
         for inclusion in self.inclusions:
             inclusion.draws.clear()
         noise = self.noise()
-        hidden = self.hidden(tried, fit.noise_samples(LATE_DRAWS, noise, self.settings.seed + 3))
+        hidden = self.hidden(tried, fit.noise_samples(LATE_DRAWS, noise, self.settings.seed + 3), noise.scale)
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
         blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2, content.unlike)
         weights = self.bending, self.dilatation

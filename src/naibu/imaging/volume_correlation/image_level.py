@@ -142,12 +142,12 @@ class GainMap:
     def local(self, value: Float32Array, weight: Float32Array, variance: float) -> tuple[Float32Array, Float32Array]:
         """Return gain and offset (n,) at the listed voxels, the most probable ones given the residual's variance."""
         matrix, load = self.normal_equations(value, weight)
-        return self.values(most_probable_gain(matrix / variance, load / variance, self.everywhere(value, weight)))
+        return self.values(most_probable_gain(matrix, load, variance, self.everywhere(value, weight)))
 
     def normal_equations(self, value: Float32Array, weight: Float32Array) -> tuple[FloatArray, FloatArray]:
-        """Return matrix (2 k, 2 k) and right side (2 k,) of gain and offset at the k points of the lattice, by least squares."""
+        """Return the matrix (2 k, 2 k) of gain and offset at the k points of the lattice, and loads (k, 3): `most_probable_gain`."""
         n = int(np.prod(self.n))
-        left, right = np.zeros((2, 2 * n, 2 * n)), np.zeros((2, 2 * n))
+        left, right = np.zeros((2, 2 * n, 2 * n)), np.zeros((2, n, 3))
         gain_normal_equations(self.level.intensity, value, weight, self.level.index, self.low, self.step, self.n, left, right)
         return left.sum(axis=0), right.sum(axis=0)
 
@@ -158,10 +158,40 @@ class GainMap:
         return a, b
 
 
-def most_probable_gain(matrix: FloatArray, load: FloatArray, everywhere: tuple[float, float, float]) -> FloatArray:
-    """Return gain and offset (2 k,) on a lattice from normal equations, and from gain, offset and SD of the intensities of all voxels."""
+def most_probable_gain(matrix: FloatArray, load: FloatArray, variance: float, everywhere: tuple[float, float, float]) -> FloatArray:
+    """Return gain and offset (2 k,) on a lattice by regression of the reference on the deformed volume, the most probable ones.
+
+    Parameters
+    ----------
+    matrix : ndarray, shape (2 k, 2 k)
+        Sums of products of the intensities of the deformed volume and ones: the matrix of least squares.
+    load : ndarray, shape (k, 3)
+        Sums of products of intensities of both volumes, of intensities of the reference, and of their squares.
+    variance : float
+        Of the residual.
+    everywhere : tuple of float
+        Gain and offset of all voxels, and SD of the intensities of the deformed volume.
+
+    Notes
+    -----
+    Noise of the deformed volume makes the slope of a regression too small :cite:p:`fuller1987`. What is left of the texture would pull at
+    edges, where it is largest: an object that moves rigidly swelled by up to a per cent in much noise. The part of the equations due to
+    noise, as large in both volumes, has the gain of all voxels instead: a ratio of standard deviations, which is not diluted.
+    """
     gain, offset, spread = everywhere
-    n = len(load) // 2
+    n = len(load)
     first = np.tile([gain, offset], n)
     prior = np.tile([(GAIN_SD * gain) ** -2, (GAIN_SD * gain * max(spread, 1e-30)) ** -2], n)
-    return np.asarray(first + linalg.solve(matrix + np.diag(prior), load - matrix @ first, assume_a="pos"))
+    root = np.sqrt(np.minimum(_noise_variance(matrix, load), variance / (2.0 * gain**2)))
+    both = load[:, :2].ravel() - matrix @ first
+    both[::2] += gain * root * (matrix[1::2, 1::2] @ root)
+    return np.asarray(first + linalg.solve(matrix / variance + np.diag(prior), both / variance, assume_a="pos"))
+
+
+def _noise_variance(matrix: FloatArray, load: FloatArray) -> FloatArray:
+    """Return the variance (k,) of the deformed volume's intensities about every point that does not correlate with the reference."""
+    product, f, ff = load.T
+    gg, g, count = matrix[::2, ::2].sum(axis=1), matrix[::2, 1::2].sum(axis=1), np.maximum(matrix[1::2, 1::2].sum(axis=1), 1e-30)
+    of_f, of_g = (np.maximum(v / count - (u / count) ** 2, 0.0) for u, v in ((f, ff), (g, gg)))
+    correlation = (product / count - f * g / count**2) / np.maximum(np.sqrt(of_f * of_g), 1e-30)
+    return np.asarray(of_g * (1.0 - np.clip(correlation, 0.0, 1.0)))

@@ -14,6 +14,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
+from naibu.imaging.volume_correlation.results.cell_errors import deformation_at_middles
 
 # empirical: mean square of the dilatation, in those of noise alone, above which it is not noise. Where volume is kept it is 0.5 to 1, and
 # at most 3; in legs more than 5 in one cell of twenty, where bending is penalised too much
@@ -33,6 +34,20 @@ def squared_dilatation(fit: CorrelationFit) -> FloatArray:
     energy = np.asarray(system.gauss_volume * system.dilatation_energy, dtype=float)
     total, count = (fit.windowed(v, WINDOW) for v in (energy, (system.gauss_volume > 0.0).astype(float)))
     return np.asarray(total / np.maximum(count, 1e-30))
+
+
+def ratio_of_all(fit: CorrelationFit, c: FloatArray, most: float) -> float:
+    """Return the ratio of volumes about which those of all cells lie, if a weight `most`, 1/mm^3, does not let expect it; else that of now.
+
+    It is taken for that of the whole object only where the ratios of nine cells of ten differ by less than they do from 1.
+    """
+    system = fit.system
+    volume = np.linalg.det(deformation_at_middles(fit, c))[system.gauss_volume > 0.0]
+    if not len(volume) or most == 0.0:
+        return system.ratio
+    low, middle, high = np.quantile(volume, [0.05, 0.5, 0.95])
+    beyond = (middle - 1.0) ** 2 * most * float(np.prod(system.grid.step_mm)) > EXPECTED
+    return float(middle) if beyond and high - low < abs(middle - 1.0) and low > 0.0 else system.ratio
 
 
 def may_swell(fit: CorrelationFit, some: BoolArray, most: float) -> BoolArray:
