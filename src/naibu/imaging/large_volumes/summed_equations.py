@@ -39,6 +39,7 @@ from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
 from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, blocks_alike, displacement_of_blocks
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
+from naibu.imaging.volume_correlation.results.hidden_dilatation import loaded_trial_parts
 from naibu.imaging.volume_correlation.splines._spline_kernels import product
 from naibu.imaging.volume_correlation.volume_changes import LATE_DRAWS
 
@@ -207,7 +208,7 @@ class SummedEquations:
         self._assembled(sums, before)
         scale = lost_to_robustness(*sums.robust)
         noise = np.ascontiguousarray(np.float32(scale) * sums.draws[:, :, :LATE_DRAWS])
-        hidden = coarse.hidden(coarse.tried(sums.matrix), self.system.solved_many(noise, SAMPLE_TOLERANCE)[0], scale)
+        hidden = coarse.hidden(loaded_trial_parts(self.system, sums.matrix), self.system.solved_many(noise, SAMPLE_TOLERANCE)[0], scale)
         samples = self._samples(np.float32(scale) * sums.draws, seed=coarse.settings.seed + 1)
         self.system.warped(coarse.c, fit.value, fit.reference_gradient, fit.gradient, fit.displacement)
         model = self._with_intensities(sums)

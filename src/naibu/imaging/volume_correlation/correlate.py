@@ -44,7 +44,7 @@ from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_
 from naibu.imaging.volume_correlation.results.block_displacements import block_displacements
 from naibu.imaging.volume_correlation.results.cell_errors import misplacement_variance
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
-from naibu.imaging.volume_correlation.results.hidden_dilatation import TrialParts, hidden_dilatation
+from naibu.imaging.volume_correlation.results.hidden_dilatation import TrialParts, hidden_dilatation, loaded_trial_parts
 from naibu.imaging.volume_correlation.rigid_parts.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion, rigid_inclusions_among
 from naibu.imaging.volume_correlation.rigid_parts.rigid_initialization import RigidInitialization, correlated_shift
@@ -385,15 +385,11 @@ class Correlation:
         stiffer = float(np.median(self.bending[fit.system.inner] / bent[fit.system.inner]))
         return self.common_dilatation > 0.5 * common and stiffer < MOST_STIFFER
 
-    def tried(self, matrix: Float32Array) -> tuple[TrialParts, Float32Array]:
-        """Return trial parts that swell, and the loads (n, 3, s) that the matrix (n, 3, 1029) of the intensities alone makes of them."""
-        trial = TrialParts.of(self.fit.system)
-        return trial, self.fit.system.multiplied(matrix, trial.coefficients)
-
     def hidden(self, tried: tuple[TrialParts, Float32Array], noise: Float32Array, robust: float) -> tuple[FloatArray, FloatArray]:
         """Return the variances (m,) of `hidden_dilatation`; the equations are assembled at the present weights.
 
-        `tried` is what `tried` returned, and `noise` (n, 3, s) are coefficients of noise alone; `robust` is that of `hidden_dilatation`.
+        `tried` is what `loaded_trial_parts` returned, `noise` (n, 3, s) are coefficients of noise alone, and `robust` is that of
+        `hidden_dilatation`.
         """
         system = self.fit.system
         some = (system.gauss_volume > 0.0) & (self.kinds < INSIDE_INCLUSION) & (self.dilatation > 0.0)
@@ -416,7 +412,7 @@ class Correlation:
         fit.compare(self.c)
 
         system.sum_intensities(fit.products)
-        tried, dilatation = self.tried(system.matrix), self.dilatation * system.gauss_volume
+        tried, dilatation = loaded_trial_parts(system, system.matrix), self.dilatation * system.gauss_volume
         system.assembled(self.c, fit.products, fit.force, self.bending, dilatation)
         require_overlap(float(fit.seen.mean()))
         refuse_unrelated(fit)

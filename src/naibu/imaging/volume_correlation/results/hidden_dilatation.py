@@ -71,6 +71,12 @@ class TrialParts:
         return cls(np.stack(out, axis=2).astype(np.float32), np.array(away), tuple(of_node), tuple(of_cell), tuple(at))
 
 
+def loaded_trial_parts(system: SplineSystem, matrix: Float32Array) -> tuple[TrialParts, Float32Array]:
+    """Return trial parts, and the loads (n, 3, s) that the matrix (n, 3, 1029) of the intensities alone makes of them."""
+    trial = TrialParts.of(system)
+    return trial, system.multiplied(matrix, trial.coefficients)
+
+
 def _cell_mm(grid: SplineGrid) -> float:
     """Return the size of a cube as large as a cell, mm."""
     return float(np.prod(grid.step_mm) ** (1.0 / 3.0))
