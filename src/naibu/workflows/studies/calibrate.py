@@ -282,7 +282,7 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
         found.append(
             "The search did not come to rest: long and short steps of time differ by more than the noise, or contacts jump between "
             "sticking and sliding. Intervals hold what the weak prior holds, as if "
-            "nothing were known; begin nearer (the calibrated study), or identify fewer parameters."
+            "nothing were known; begin nearer (the calibrated study), identify fewer parameters, or give the study a finer lattice."
         )
     for what, factor in zip(("points", "forces"), estimate.noise_factor, strict=True):
         if factor > 1.3:
