@@ -171,7 +171,7 @@ def joint_model(
             notes.append(f"{met.capitalize()}; predictions of experiments count that in, smaller elements may lessen it.")
     predictive = None if markers.predictive is None else _predictive(markers, markers.predictive, found, joint, left**2 - own**2)
     of_markers = replace(
-        markers, parameters=parameters, covariance=covariance, predictive=predictive, reservation=_both(markers.reservation, *doubts)
+        markers, parameters=parameters, covariance=covariance, predictive=predictive, reservation=_both(*doubts, markers.reservation)
     )
     assert found.uncertainty is not None  # `told_by_fields` refuses it
     of_theta, own_fields = _finite(found.uncertainty.covariance)[1], told_by_fields(found)
@@ -180,7 +180,7 @@ def joint_model(
     scales, spread = moved_along(own_fields.values, slope @ of_theta @ slope.T, np.eye(len(slope)), own_fields, joint.together)
     theta = _theta_of(scales)
     back = np.linalg.inv(_slope_of_theta(theta))
-    reservation = _both(fields.reservation, *doubts)
+    reservation = _both(*doubts, fields.reservation)
     of_fields = replace(
         fields, theta=theta, covariance=None if fields.covariance is None else back @ spread @ back.T, reservation=reservation
     )
