@@ -38,6 +38,7 @@ COMMANDS: dict[str, tuple[str | None, str]] = {
     "surface_cutting": (None, "surface_cutting.py"),
     "volume_cutting": (None, "volume_cutting.py"),
     "cut_strokes": ("cut_strokes.py 4", "cut_strokes.py"),
+    "cut_deviation": ("cut_deviation.py 20 2", "cut_deviation.py"),
     "cut_contact": (None, "cut_contact.py"),
     "large_volumes": (None, "large_volumes.py --sizes 160 256 --peers --record"),
     "live_page": (None, "live_page.py --record"),
