@@ -136,7 +136,7 @@ def test_momentum_balances_with_the_forces_of_constraints_and_indenters() -> Non
     bottom = LATTICE.points[BOTTOM.node[::3]]
     np.testing.assert_allclose(state.position[BOTTOM.node[::3]] - bottom, np.tile([0.4, 0.0, 0.0], (len(bottom), 1)), atol=1e-9)
     assert forces.indenters[-1, 0, 2] < -10.0
-    assert BALL.gap(state.position - (0.8, 0.0, -6.0)).min() > -1.05  # the ball is as small as a face: the foundation yields
+    assert BALL.gap(state.position - (0.8, 0.0, -6.0)).min() > -1.1  # the ball is as small as a face: the foundation yields
 
 
 @pytest.mark.parametrize("driven", [False, True], ids=["velocity", "force"])
