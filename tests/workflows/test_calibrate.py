@@ -103,6 +103,19 @@ def test_an_interrupted_run_writes_the_best_so_far(inputs: tuple[Path, Path, Pat
     assert all(file.exists() for file in run.files)
 
 
+def test_parameters_that_the_data_do_not_determine_are_given_no_value(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    """Points captured before anything moves tell nothing of K and C1, wherever the search ends."""
+    study, _, _ = inputs
+    points = prepared_study(study).study.lattice.points
+    cloud = tmp_path / "rest.csv"
+    cloud.write_text("time_s,x_mm,y_mm,z_mm\n" + "".join(f"0,{x:.4f},{y:.4f},{z:.4f}\n" for x, y, z in points), encoding="utf-8")
+    run = calibrate_study(study, shapes=[cloud], out=tmp_path / "out", groups="all")
+    assert not run.estimate.determined().any() and "determine no parameter" in " ".join(run.warnings)
+    assert all("not determined" in said for said in run.estimate.sentences()[:2])
+    assert "<td>not determined</td>" in run.files[0].read_text(encoding="utf-8").replace(' class="text"', "")
+    assert not any(row["determined"] for row in json.loads(run.files[1].read_text(encoding="utf-8"))["parameters"])
+
+
 def test_captures_in_other_coordinates_are_told(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
     study, _, sensor = inputs
     shifted = tmp_path / "shifted.csv"

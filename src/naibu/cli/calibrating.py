@@ -133,9 +133,9 @@ def _show(run: LatticeCalibration) -> None:
 
     found = run.estimate
     rows = [
-        (name, f"{value:.4g}", f"{low:.4g} to {high:.4g}", unit)
-        for name, unit, value, (low, high) in zip(
-            found.unknowns.names, found.unknowns.units, found.values, held_intervals(found), strict=True
+        (name, f"{value:.4g}" if known else "not determined", f"{low:.4g} to {high:.4g}", unit)
+        for name, unit, value, (low, high), known in zip(
+            found.unknowns.names, found.unknowns.units, found.values, held_intervals(found), found.determined(), strict=True
         )
     ]
     print_table("naibu calibrate", ("parameter", "estimate", "95 % interval", "unit"), rows, left=True)

@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import BoolArray, FloatArray
 from naibu.identification.lattice_calibration.inverse_problem import Unknowns
+
+UNDETERMINED = 4.0  # factor within which a parameter lies at 95 %, from which it is called not determined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,9 +60,15 @@ class LatticeEstimate:
         half = 1.96 * np.sqrt(np.diag(self.covariance))
         return np.stack([self.values * np.exp(-half), self.values * np.exp(half)], axis=1)
 
+    def determined(self) -> BoolArray:
+        """Return which parameters (p,) the data determine within a factor of 4 at 95 %; of others little more is known than beforehand."""
+        return np.asarray(1.96 * np.sqrt(np.diag(self.covariance)) <= np.log(UNDETERMINED))
+
     def sentences(self) -> tuple[str, ...]:
         """Return the result in sentences, and what the data do not determine."""
         lines = []
-        for name, unit, value, (low, high) in zip(self.unknowns.names, self.unknowns.units, self.values, self.intervals(), strict=True):
-            lines.append(f"{f'{name}: {value:.4g} {unit}'.rstrip()} (95 % between {low:.4g} and {high:.4g})")
+        rows = zip(self.unknowns.names, self.unknowns.units, self.values, self.intervals(), self.determined(), strict=True)
+        for name, unit, value, (low, high), known in rows:
+            said = f"{value:.4g} {unit}".rstrip() if known else "not determined"
+            lines.append(f"{name}: {said} (95 % between {low:.4g} and {high:.4g})")
         return (*lines, *self.undetermined)

@@ -124,7 +124,10 @@ class StudyModel:
         captures = tuple(round(time / study.step_s) for time in capture_s)
         most = round(study.frames * study.frame_s / study.step_s)
         if max(captures, default=0) > most or windows * window_steps > most:
-            raise InputError(f"captures last until {max(capture_s):g} s, the study {most * study.step_s:g} s; make duration_s larger")
+            raise InputError(
+                f"captures last until {max(capture_s):g} s, the study {most * study.step_s:g} s; "
+                "count time from its beginning, or make its duration_s larger"
+            )
         end = max(*captures, windows * window_steps, 1)
         each = np.full((windows * window_steps, len(study.bodies)), 1.0 / window_steps) if shares is None else shares
         weights = np.concatenate([np.zeros((1, len(study.bodies))), np.cumsum(each, axis=0)])

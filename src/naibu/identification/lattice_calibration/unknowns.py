@@ -137,7 +137,7 @@ def identifiability(names: tuple[str, ...], information: FloatArray, *, loose: f
             continue
         strong = vector / vector[np.argmax(np.abs(vector))]
         order = [int(k) for k in np.argsort(-np.abs(strong)) if abs(strong[k]) > 0.25]
-        parts = [f"{names[k]} {'up' if strong[k] > 0 else 'down'}" for k in order[:MOST_NAMED]]
+        parts = [names[order[0]]] if len(order) == 1 else [f"{names[k]} {'up' if strong[k] > 0 else 'down'}" for k in order[:MOST_NAMED]]
         if len(order) > MOST_NAMED:
             parts.append("others")
         if len(names) > 1 and strong.min() > 0.5:

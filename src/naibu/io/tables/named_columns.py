@@ -76,7 +76,7 @@ def read_named_columns(path: Path, kinds: Mapping[str, ColumnKind], labels: tupl
     """
     rows = _rows(path)
     if len(rows) < 2:
-        raise InputError(f"{path}: has {len(rows)} rows; it needs a row of names and rows of numbers")
+        raise InputError(f"{path}: has {len(rows)} line{'s' * (len(rows) != 1)}; it needs a row of names and rows of numbers")
     header = [cell.strip() for cell in rows[0][1]]
     found = {key: _located(path, header, kind) for key, kind in kinds.items()}
     missing = [kind.names[0] for key, kind in kinds.items() if kind.needed and found[key] is None]

@@ -300,6 +300,10 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
             "in other coordinates, or size_mm is not that of the object. Estimates absorb this."
         )
     unknowns = problem.unknowns
+    if not (known := estimate.determined()).any():
+        found.append("The data determine no parameter: the calibrated study states what the search began with, or anything.")
+    elif left := [name for name, one in zip(unknowns.names, known, strict=True) if not one]:
+        found.append(f"Not determined within a factor of 4: {', '.join(left)}. The calibrated study states one value of many that fit.")
     for name, value, (low, high) in zip(unknowns.names, estimate.values, unknowns.bounds, strict=True):
         if not low < value < high:
             found.append(f"{name} has reached the end of its range, {low:g} to {high:g}.")
@@ -368,12 +372,12 @@ def _hashes(sources: Sequence[str | os.PathLike[str]]) -> dict[str, str]:
 
 def _numbers(estimate: LatticeEstimate) -> dict[str, Any]:
     unknowns, low_high = estimate.unknowns, held_intervals(estimate)
-    rows = zip(unknowns.names, unknowns.units, estimate.values.tolist(), low_high.tolist(), strict=True)
+    rows = zip(unknowns.names, unknowns.units, estimate.values.tolist(), low_high.tolist(), estimate.determined().tolist(), strict=True)
     return {
         "naibu": __version__,
         "finished": estimate.finished,
         "settled": estimate.settled,
-        "parameters": [{"name": n, "unit": u, "value": v, "interval_95": i} for n, u, v, i in rows],
+        "parameters": [{"name": n, "unit": u, "value": v, "interval_95": i, "determined": d} for n, u, v, i, d in rows],
         "covariance_of_logarithms": estimate.covariance.tolist(),
         "noise_factor": dict(zip(("points", "forces"), [None if np.isnan(f) else f for f in estimate.noise_factor], strict=True)),
         "undetermined": list(estimate.undetermined),

@@ -125,9 +125,9 @@ def calibration_chapter(
 def _estimates(problem: StudyProblem, estimate: LatticeEstimate, warnings: Sequence[str]) -> Section:
     unknowns, low_high = problem.unknowns, held_intervals(estimate)
     rows = tuple(
-        (name, unit, float(value), float(low), float(high), float(start))
-        for name, unit, value, (low, high), start in zip(
-            unknowns.names, unknowns.units, estimate.values, low_high, unknowns.start, strict=True
+        (name, unit, float(value) if known else "not determined", float(low), float(high), float(start))
+        for name, unit, value, known, (low, high), start in zip(
+            unknowns.names, unknowns.units, estimate.values, estimate.determined(), low_high, unknowns.start, strict=True
         )
     )
     parts = [
