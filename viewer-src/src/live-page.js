@@ -86,6 +86,7 @@ class LivePage {
       h("option", { value: "displacement" }, "displacement, mm"), h("option", { value: "strain" }, this.scene.strain));
     this.badge = h("p", { class: "badge", role: "status" }, "connecting");
     this.message = h("p", { class: "note trouble", role: "alert" });
+    this.caution = h("p", { class: "note trouble", role: "status" }); // of the tool in play
     this.readout = h("p", { class: "readout", "aria-hidden": "true" }); // where the numbers are too far below to be seen
     this.canvas = h("canvas", { class: "time-curve", role: "img", "aria-label": "Force of the last ten seconds" });
     this.numbers = Object.fromEntries(["force", "pull", "penetration", "time", "rate", "probe"].map((name) => [name, h("dd", {}, "–")]));
@@ -102,7 +103,7 @@ class LivePage {
         this.#button("Whole view", () => this.view.look("oblique"))),
       h("div", { class: "live-grid" },
         h("div", {}, this.stage, this.hint, h("div", { class: "motion-scale" }, this.gradient, this.ticks), this.#viewControls()),
-        h("div", { class: "live-side" }, this.badge, this.message, list, this.canvas,
+        h("div", { class: "live-side" }, this.badge, this.message, this.caution, list, this.canvas,
           h("div", { class: "bar" }, this.record, this.#button("▶ Replay", () => this.command("replay")),
             this.#button("Save as a page", () => this.#save()),
             this.#button("Screenshot", () => this.#screenshot())))),
@@ -376,6 +377,7 @@ class LivePage {
     if (!frame.driving) text += " (watching)";
     const write = (element, said) => { if (element.textContent !== said) element.textContent = said; };
     write(this.badge, text);
+    write(this.caution, this.scene.tools[frame.tool]?.caution ?? "");
     this.badge.dataset.held = String(real >= 97 || frame.paused || frame.replaying);
     write(this.pause, frame.paused ? "▶ Go on" : "❚❚ Pause");
     write(this.record, frame.recording ? "■ Stop" : "● Record");

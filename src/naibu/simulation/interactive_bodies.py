@@ -21,6 +21,7 @@ from naibu.mechanics.finite_elements.hyperelasticity import material
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine, DynamicState
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeEngine, RealTimeSession
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
+from naibu.mechanics.lattices.model.contact_surface import unresolved
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 from naibu.mechanics.lattices.model.surface import surface_triangles
 from naibu.meshing.cutting.swept_blade import SweptBlade
@@ -84,6 +85,9 @@ class InteractiveBody(Protocol):
 
     def unbalanced(self, session: AnySession) -> float:
         """Return the out-of-balance force that the last step left to the next ones, as a fraction of all forces."""
+
+    def caution(self, name: str, tool: RigidIndenter) -> str:
+        """Return what is to be said of the forces of a tool of this name; empty where nothing is."""
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return a scalar strain at the nodes (n,), %, at positions (n, 3), mm."""
@@ -191,6 +195,10 @@ class LatticeBody:
     def unbalanced(self, session: AnySession) -> float:
         """Return 0: a step of a lattice leaves nothing out of balance."""
         return 0.0
+
+    def caution(self, name: str, tool: RigidIndenter) -> str:
+        """Return that the faces of the lattice do not resolve what a tool touches, and by how much its force may be wrong; else nothing."""
+        return unresolved(self.engine.lattice, tool.geometry, name)
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return the mean elongation of the elements at every node (n,), % of their length at rest."""
@@ -381,6 +389,10 @@ class FiniteElementBody:
     def unbalanced(self, session: AnySession) -> float:
         """Return the out-of-balance force that the last step left to the next ones, as a fraction of all forces."""
         return session.unbalanced if isinstance(session, RealTimeSession) else 0.0
+
+    def caution(self, name: str, tool: RigidIndenter) -> str:
+        """Return nothing: how wrong forces of tools smaller than elements are was not measured."""
+        return ""
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return the von Mises equivalent of the Green-Lagrange strain at the nodes (n,), %, averaged over the tetrahedra around them."""

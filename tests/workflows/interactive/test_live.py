@@ -19,6 +19,7 @@ from touched_lattice import touched_lattice
 
 from naibu.core.errors import InputError
 from naibu.io.vtk_files import write_vtu
+from naibu.mechanics import spherical_indenter
 from naibu.meshing import box
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.simulation import FiniteElementBody, InteractiveSimulation, RealTimeLoop
@@ -66,6 +67,27 @@ def test_a_person_pushes_pulls_looks_inside_and_saves(tmp_path: Path) -> None:
         assert page.console == []
         assert len(page.picture(tmp_path / "live.png").read_bytes()) > 10_000
         assert "Recorded from the live page." in simulation.recording_html()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_the_page_says_of_the_tool_in_play_that_it_is_small_beside_the_cubes(tmp_path: Path) -> None:
+    """The sphere has a radius of 5.6 mm, and cubes of 10 mm."""
+    body = touched_lattice()
+    tools = tools_for(body)
+    assert body.caution("the sphere", tools["sphere"]).startswith("The radius of the sphere is 0.56 of the edge of the faces")
+    assert body.caution("the sphere", spherical_indenter((0.0, 0.0, 60.0), 10.0)) == ""
+    with served() as (address, _), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.wait("naibuLive.caution.textContent.startsWith('The radius of the sphere is 0.56')", 30)
+        page.picture(tmp_path / "small.png")
+        page.value("naibuLive.take('plate')")
+        page.wait("naibuLive.frame.tool === 1 && naibuLive.caution.textContent === ''", 30)
+        page.value("naibuLive.take('bar')")
+        page.wait("naibuLive.caution.textContent.startsWith('The radius of the bar is 0.28')", 30)
+        page.value("naibuLive.take('')")
+        page.wait("naibuLive.frame.tool === -1 && naibuLive.caution.textContent === ''", 30)
+        assert page.console == []
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")

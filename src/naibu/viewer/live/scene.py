@@ -101,6 +101,8 @@ class LiveScene:
         What frames carry, in that order.
     cut_stages : sequence of str
         What is computed before a cut opens, in the order in which frames number it.
+    cautions : sequence of str
+        What the page says of the forces of each tool while it is in play; empty texts, or none at all, where there is nothing to say.
     """
 
     title: str
@@ -119,6 +121,7 @@ class LiveScene:
     cuttable: bool = False
     readings: Sequence[LiveReading] = ()
     cut_stages: Sequence[str] = ()
+    cautions: Sequence[str] = ()
 
     def payload(self) -> dict[str, object]:
         """Return the scene for JSON; ``viewer-src/src/live-decode.js`` is the inverse."""
@@ -130,7 +133,7 @@ class LiveScene:
             "cells": _base64(self.cells, "<u4"),
             "closed": is_closed(np.asarray(self.points, dtype=float), self.faces),
             "outline": _base64(cut_outline(np.asarray(self.points, dtype=float), self.faces), "<u4"),
-            "tools": [_shape(s) for s in self.tools],
+            "tools": [_shape(s) | {"caution": said} for s, said in zip(self.tools, self.cautions or [""] * len(self.tools), strict=True)],
             "fixtures": [_shape(s) | {"centre": c.tolist()} for s, c in zip(self.fixtures, self.fixture_centres, strict=True)],
             "markers": {
                 "nodes": _base64(self.marker_nodes, "<u4"),

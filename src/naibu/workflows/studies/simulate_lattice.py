@@ -17,7 +17,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.io.files.atomic import write_atomically
 from naibu.io.vtkhdf_series import SeriesFile
-from naibu.mechanics.lattices.model.contact_surface import RESOLVED, radius_over_face
+from naibu.mechanics.lattices.model.contact_surface import unresolved
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, StudyFrame, StudyState, run_study
 from naibu.viewer.cards import Card
@@ -363,13 +363,8 @@ def _sentences(prepared: PreparedStudy, state: StudyState, force: FloatArray) ->
 
 def _warnings(prepared: PreparedStudy) -> tuple[str, ...]:
     """Return which indenters are smaller than what the surface resolves."""
-    ratios = ((b.name, radius_over_face(prepared.study.lattice, b.indenter.geometry)) for b in prepared.study.bodies)
-    return tuple(
-        f"The radius of {name} is {ratio:.2g} of the edge of the faces, which do not resolve what it touches: its force may be wrong by 5 %"
-        " at 0.7 and by 10 % at 0.5 edges (3 % at 1); use smaller cubes, or an octree."
-        for name, ratio in ratios
-        if ratio < RESOLVED
-    )
+    said = (unresolved(prepared.study.lattice, b.indenter.geometry, b.name) for b in prepared.study.bodies)
+    return tuple(filter(None, said))
 
 
 def _cards(prepared: PreparedStudy, force: FloatArray, moved: FloatArray) -> tuple[Card, ...]:

@@ -1,4 +1,4 @@
-"""Plates that cover whole faces of a viscous block: pressures of nodes must neither grow by themselves nor give way at the rim."""
+"""Indenters that cover whole faces of a viscous block: pressures of nodes must neither grow by themselves nor give way at the rim."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from naibu.core.arrays import FloatArray
-from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, plane_indenter
+from naibu.mechanics.contact.indenter_motion import IndenterVelocity
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter, capsule_indenter, plane_indenter, spherical_indenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
@@ -47,6 +48,38 @@ def test_what_rounding_differs_by_does_not_grow(friction: float) -> None:
         moved = motion.state.position - engine.lattice.points
         mirrored = np.argsort(np.lexsort(engine.lattice.points.T)), np.lexsort((engine.lattice.points * [-1.0, 1.0, 1.0]).T)
         np.testing.assert_allclose(moved[mirrored[1]][mirrored[0]] * [-1.0, 1.0, 1.0], moved, atol=1e-6)
+
+
+def rubbed(step: float, indenter: RigidIndenter) -> list[FloatArray]:
+    """Return the nodes (n, 3) in every step while an indenter goes down 4 mm, rests, and goes to and fro."""
+    engine = engine_of(step)
+    held = ConstrainedNodes.of(np.flatnonzero(engine.lattice.points[:, 2] == 0.0))
+    down, still = [(0.0, 0.0, -20.0)] * round(0.2 / step), [(0.0, 0.0, 0.0)] * round(0.4 / step)
+    fro = [(sign * 10.0, 0.0, 0.0) for sign in (1.0, -1.0) for _ in range(round(0.3 / step))]
+    with engine.session(constrained=held, indenters=[indenter]) as session:
+        found = []
+        for velocity in [*down, *still, *fro]:
+            session.step(motions=[IndenterVelocity(velocity)])
+            found.append(session.positions())
+    return found
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.3])
+@pytest.mark.parametrize("radius", [12.0, 200.0])
+@pytest.mark.parametrize("kind", ["sphere", "cylinder"])
+def test_what_rounding_differs_by_does_not_grow_under_round_indenters(kind: str, radius: float, friction: float) -> None:
+    """Their pressures follow what they cover at the time, which for flat ones had made differences grow by some per cent in every step."""
+    surface = {"static_friction": friction, "kinetic_friction": friction}
+
+    def placed(height: float) -> RigidIndenter:
+        at = (16.3, 18.1, SIDE + radius + height)
+        sphere = spherical_indenter(at, radius, **surface)
+        return sphere if kind == "sphere" else capsule_indenter(at, radius, 3.0 * SIDE, (0.0, 1.0, 0.0), **surface)
+
+    apart = 1e-10
+    one, other = rubbed(0.002, placed(0.0)), rubbed(0.002, placed(apart))
+    assert np.abs(one[-1] - one[0]).max() > 0.5
+    assert max(np.abs(a - b).max() for a, b in zip(one, other, strict=True)) < 100.0 * apart
 
 
 def tied_force(step: float, seconds: float) -> FloatArray:
