@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import pytest
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.forward.field_laws import field_law
@@ -13,10 +14,11 @@ from naibu.identification.from_fields.forward.forward_model import Solvers, equi
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
-from naibu.identification.from_fields.inversion.gauss_newton import Bounds, first_point
-from naibu.identification.from_fields.regions.border_refinement import RefinedRegions, on_finer_cells, refined_borders
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, first_point, search
+from naibu.identification.from_fields.inversion.regularization import ZoneGraph
+from naibu.identification.from_fields.regions.border_refinement import RefinedRegions, on_finer_cells, refined_borders, refined_regions
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
-from naibu.identification.from_fields.regions.segmentation import joined
+from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined, merged
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
@@ -118,6 +120,63 @@ def test_derivatives_of_the_moduli_of_cells() -> None:
         np.testing.assert_allclose((ends[0] - ends[1]) / (2.0 * step), slopes[:, column], atol=1e-6)
 
 
+def test_derivatives_where_two_lumps_are_of_one_material() -> None:
+    fields, pieces = _two_lumps()
+    zones = joined(fields.zones, np.minimum(pieces, 1))
+    mixing = Mixing.of(fields, Borders.of(fields.mesh, zones, joined(fields.zones, pieces)))
+    assert mixing.borders.region_of_piece.tolist() == [0, 1, 1]
+    rng = np.random.default_rng(2)
+    theta, moves = np.array([1.0, 2.0, 2.5, 2.2]), mixing.borders.moves.ravel() + 0.2 * rng.standard_normal(20)
+    way = rng.standard_normal(24)
+    ends = [mixing.moduli(theta + s * way[:4], moves + s * way[4:])[0] for s in (1e-6, -1e-6)]
+    np.testing.assert_allclose((ends[0] - ends[1]) / 2e-6, mixing.moduli(theta, moves)[1] @ way, atol=1e-6)
+    at = np.array([[-7.0, 0.0, 20.0], [7.0, 0.0, 20.0], [0.0, 0.0, 20.0]])
+    assert mixing.borders.region_at(at, np.zeros(3)).tolist() == [1, 1, 0]
+
+
+@pytest.mark.parametrize(("other", "regions"), [(12.0, 2), (40.0, 3)])
+def test_lumps_are_of_one_material_where_the_data_do_not_tell_their_moduli_apart(other: float, regions: int) -> None:
+    """Of lumps of one size, one has too many cells and one too few, so that their moduli differ until borders are free."""
+    fields, pieces = _two_lumps()
+    lame, shear = np.array([lame_parameters(e, 0.45) for e in (5.0, 12.0, other)]).T
+    theta = logarithms(lame, shear)
+    mixing = Mixing.of(fields, replace(Borders.of(fields.mesh, joined(fields.zones, pieces)), round=np.ones(2, dtype=bool)))
+    again, start = _measured(fields, mixing.moduli(theta, mixing.borders.moves.ravel())[0], seed=4)
+    uneven = _two_lumps(5.8, 3.4)[1]
+    zones = joined(fields.zones, uneven)
+    of_cells = again.with_zones(zones)
+    whole = search(of_cells, of_cells.evaluate(theta, start.states), Objective(bounds=Bounds())).point
+    graph = ZoneGraph.of(fields.mesh, fields.zones)
+    quadratic = of_cells.linearised(whole).concentrated(np.eye(6))
+    kept, _ = merged(quadratic, whole.theta, areas_between(graph, uneven), 0.0, np.log(of_cells.n_free) + np.log(graph.count))
+    assert kept.max() == 2  # with whole cells they are told apart, wrongly where they are of one material
+    found = refined_regions(again, Segmentation(uneven, zones, whole, 20, 0), graph, Bounds())
+    assert found.zones.count == regions and found.borders.moves.shape == (2, 10)
+    truth = np.array([5.0, 12.0, other])[:regions]
+    off = np.abs(np.log(young_and_poisson(found.theta)[0] / truth))
+    assert (off < 3.0 * np.sqrt(np.diag(found.covariance))[:regions]).all()
+
+
+def _two_lumps(*radii_mm: float) -> tuple[FieldModel, np.ndarray]:
+    """Return the block, and 1 and 2 in balls on its left and right for each of its zones, 0 around them."""
+    fields, _ = model()
+    middles = fields.mesh.points[fields.mesh.cells].mean(axis=1)[fields.zones.of_cell >= 0]
+    pieces = np.zeros(len(middles), dtype=np.int64)
+    for number, (x, radius) in enumerate(zip((-7.0, 7.0), radii_mm or (5.0, 5.0), strict=True), start=1):
+        pieces[np.linalg.norm(middles - [x, 0.0, 20.0], axis=1) < radius] = number
+    return fields, pieces
+
+
+def _measured(fields: FieldModel, theta: np.ndarray, seed: int) -> tuple[FieldModel, Point]:
+    """Return the model with measurements of moduli of all its zones, and their equilibrium."""
+    start = first_point(fields, theta)
+    rng = np.random.default_rng(seed)
+    case = fields.observed[0].load_case
+    seen = (fields.observed[0].operator @ start.states[0].ravel() * SD_MM).reshape(-1, 3) + SD_MM * rng.standard_normal((1200, 3))
+    case = replace(case, field=DisplacementField.from_arrays(case.field.points, seen, sd_mm=SD_MM))
+    return FieldModel(fields.mesh, [case], fields.zones, "linear", "accurate"), start
+
+
 def test_size_and_stiffness_of_an_inclusion_are_found_together() -> None:
     """Measurements of a mixed border on the same cells: the interval holds the modulus, and is wider than with a known border."""
     fields, zones = model()
@@ -125,13 +184,7 @@ def test_size_and_stiffness_of_an_inclusion_are_found_together() -> None:
     lame, shear = np.array([lame_parameters(e, 0.45) for e in truth]).T
     mixing = Mixing.of(fields, Borders.of(fields.mesh, zones))
     moves = mixing.borders.moves.ravel() + np.array([0.7, 0.3, 0, 0, 0, 0, 0, 0, 0, 0])
-    start = first_point(fields, mixing.moduli(logarithms(lame, shear), moves)[0])
-    state = start.states[0]
-    rng = np.random.default_rng(3)
-    field = fields.observed[0].load_case.field
-    seen = (fields.observed[0].operator @ state.ravel() * SD_MM).reshape(-1, 3) + SD_MM * rng.standard_normal(field.points.shape)
-    case = replace(fields.observed[0].load_case, field=DisplacementField.from_arrays(field.points, seen, sd_mm=SD_MM))
-    again = FieldModel(fields.mesh, [case], fields.zones, "linear", "accurate")
+    again, start = _measured(fields, mixing.moduli(logarithms(lame, shear), moves)[0], seed=3)
     guess = replace(start, theta=logarithms(*np.array([lame_parameters(e, 0.45) for e in (6.0, 9.0)]).T))
     found = refined_borders(again, zones, guess, Bounds())
     young = young_and_poisson(found.theta)[0]

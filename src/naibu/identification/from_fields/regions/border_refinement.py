@@ -12,12 +12,13 @@ size change (defect correction, :cite:p:`stetter1978`); what half of their size 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import LawName
@@ -75,15 +76,19 @@ class RefinedRegions:
         """Return lambda and mu (m,), kPa, of the cells of another mesh of the body; `zones` tell which of them are known."""
         unknown = np.flatnonzero(zones.of_cell != KNOWN)
         edge = float(np.median(cell_volumes(mesh)) ** (1.0 / 3.0))
-        share = Mixing.at(self.borders, mesh, unknown, edge).fractions(self.borders.moves.ravel())[0]
-        shear, ratio = np.exp(np.column_stack([1.0 - share.sum(axis=1), share]) @ self.theta.reshape(2, -1).T).T
+        share = Mixing.at(self.borders, mesh, unknown, edge).shares(self.borders.moves.ravel())
+        shear, ratio = np.exp(share @ self.theta.reshape(2, -1).T).T
         lame, out = zones.known_lambda.copy(), zones.known_mu.copy()
         lame[unknown], out[unknown] = shear * (ratio - 2.0 / 3.0), shear
         return lame, out
 
 
 def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, bounds: Bounds) -> RefinedRegions:
-    """Fit the borders of regions, and join regions that only stood for cells on borders.
+    """Fit the borders of regions, and join regions that only stood for cells on borders, or are of one material.
+
+    Moduli of whole cells depend on how many of these a lump happened to get, so that two lumps of one material look different; only with
+    free borders do the data tell. Regions are joined as one piece, which spares two moduli and a location, or as pieces with a border each
+    that share their moduli, which spares the moduli: whichever lowers the criterion of the segmentation more.
 
     Parameters
     ----------
@@ -101,32 +106,75 @@ def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, 
     ConvergenceError
         The data do not determine moduli and borders together.
     """
-    charge = float(np.log(model.n_free) + np.log(graph.count))
-    labels, best = regions.of_zone, refined_borders(model, regions.zones, regions.point, bounds)
+    of_moduli, of_location = float(np.log(model.n_free)), float(np.log(graph.count))
+    labels = pieces = regions.of_zone
+    best = refined_borders(model, regions.zones, regions.point, bounds)
     while best.zones.count > 2:
-        trials = []
-        touching = np.argwhere(np.triu(areas_between(graph, labels), 1) > 0.0)
-        jumps = np.abs(best.theta[touching[:, 0]] - best.theta[touching[:, 1]])
-        for a, b in touching[np.argsort(jumps)[:CANDIDATES]]:
-            new = np.unique(np.where(labels == b, a, labels), return_inverse=True)[1].ravel()
-            order = np.argsort(-np.bincount(new, graph.volume), kind="stable")
-            new = np.argsort(order)[new].astype(np.int64)
-            mean = np.bincount(new, graph.volume * best.theta[labels]) / np.bincount(new, graph.volume)
-            ratio = np.bincount(new, graph.volume * best.theta[best.zones.count :][labels]) / np.bincount(new, graph.volume)
-            zones = joined(model.zones, new)
-            start = replace(regions.point, theta=np.concatenate([mean, ratio]))
-            with contextlib.suppress(ConvergenceError):  # regions that are too different to be one; others may be joined
-                trials.append((new, refined_borders(model, zones, start, bounds)))
+        trials: list[tuple[float, IntArray, IntArray, RefinedRegions]] = []
+        for a, b, one in _of_one_material(model, best, bounds):
+            as_one = np.where(labels == b, a, labels)
+            trials.append((one.objective - of_moduli, as_one - (as_one > b), pieces, one))
+        for new, of_pieces, one in _within_one_border(model, graph, regions.point, (labels, pieces), best, bounds):
+            trials.append((one.objective - of_moduli - of_location, new, of_pieces, one))
         if not trials:
             break
-        new, trial = min(trials, key=lambda t: t[1].objective)
-        if trial.objective > best.objective + charge:
+        chosen = min(trials, key=lambda t: t[0])
+        if chosen[0] > best.objective:
             break
-        labels, best = new, trial
+        _, labels, pieces, best = chosen
     return best
 
 
-def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bounds) -> RefinedRegions:
+def _of_one_material(model: FieldModel, found: RefinedRegions, bounds: Bounds) -> list[tuple[int, int, RefinedRegions]]:
+    """Return the two regions, apart from the largest, whose moduli differ least for their joint covariance, as one of several pieces.
+
+    Their borders stay what they are: whether two lumps are of one material is asked of their moduli, not of their shapes. An empty list
+    where there are no two, or no equilibrium with the same moduli in both.
+    """
+    k = found.zones.count
+    pairs = list(combinations(range(1, k), 2))
+    precision = np.linalg.inv(found.covariance)
+    ends = []
+    for a, b in pairs:
+        gather = np.kron(np.eye(2), np.delete(np.eye(k) + np.outer(np.eye(k)[b], np.eye(k)[a]), b, axis=1))
+        theta = np.linalg.solve(gather.T @ precision @ gather, gather.T @ precision @ found.theta)
+        apart = found.theta - gather @ theta
+        ends.append((float(apart @ precision @ apart), a, b, theta))
+    if not ends:
+        return []
+    _, a, b, theta = min(ends, key=lambda e: e[0])
+    of_piece = found.mixing.borders.region_of_piece
+    of_piece = np.where(of_piece == b, a, of_piece)
+    mixing = replace(found.mixing, borders=replace(found.mixing.borders, region_of_piece=of_piece - (of_piece > b)))
+    try:
+        start = _Trial.at(model, mixing, Objective(bounds=bounds).clipped(theta), found.borders.moves.ravel(), found.point.states)
+        return [(a, b, _with_covariance(model, mixing, _descended(model, mixing, start, bounds)))]
+    except ConvergenceError:
+        return []
+
+
+def _within_one_border(
+    model: FieldModel, graph: ZoneGraph, near: Point, parting: tuple[IntArray, IntArray], found: RefinedRegions, bounds: Bounds
+) -> Iterator[tuple[IntArray, IntArray, RefinedRegions]]:
+    """Give regions that touch and whose shear moduli are most alike as one piece: labels and pieces of all zones, and the fit."""
+    labels, pieces = parting
+    touching = np.argwhere(np.triu(areas_between(graph, labels), 1) > 0.0)
+    jumps = np.abs(found.theta[touching[:, 0]] - found.theta[touching[:, 1]])
+    for a, b in touching[np.argsort(jumps)[:CANDIDATES]]:
+        new = np.unique(np.where(labels == b, a, labels), return_inverse=True)[1].ravel()
+        order = np.argsort(-np.bincount(new, graph.volume), kind="stable")
+        new = np.argsort(order)[new].astype(np.int64)
+        mean = np.bincount(new, graph.volume * found.theta[labels]) / np.bincount(new, graph.volume)
+        ratio = np.bincount(new, graph.volume * found.theta[found.zones.count :][labels]) / np.bincount(new, graph.volume)
+        both = (labels == a) | (labels == b)
+        of_pieces = np.where(new == 0, -1, np.where(both, pieces[both].min(), pieces))
+        of_pieces = np.unique(of_pieces, return_inverse=True)[1].ravel().astype(np.int64)
+        start = replace(near, theta=np.concatenate([mean, ratio]))
+        with contextlib.suppress(ConvergenceError):  # regions that are too different to be one; others may be joined
+            yield new, of_pieces, refined_borders(model, joined(model.zones, new), start, bounds, joined(model.zones, of_pieces))
+
+
+def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bounds, pieces: Zones | None = None) -> RefinedRegions:
     """Fit the borders of regions and their moduli.
 
     Parameters
@@ -139,13 +187,15 @@ def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bound
         The fit of regions of whole cells.
     bounds : Bounds
         Of the moduli.
+    pieces : Zones, optional
+        Pieces of the regions, numbered as in `Borders`; by default every region is one.
 
     Raises
     ------
     ConvergenceError
         The data do not determine moduli and borders together.
     """
-    cells = Borders.of(model.mesh, zones)
+    cells = Borders.of(model.mesh, zones, pieces)
     starts = [cells] + [ball for ball in [cells.rounded()] if ball.round.any()]
     ends: list[tuple[Mixing, _Trial]] = []
     for last, borders in enumerate(starts, 1 - len(starts)):
@@ -159,8 +209,10 @@ def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bound
 
 def _searched(model: FieldModel, mixing: Mixing, start: Point, bounds: Bounds) -> tuple[Mixing, _Trial]:
     """Return where Gauss-Newton steps lead from borders that keep the volume."""
-    first = mixing.borders.moves.ravel()
-    here = _Trial.at(model, mixing, start.theta, first, start.states)
+    return mixing, _descended(model, mixing, _Trial.at(model, mixing, start.theta, mixing.borders.moves.ravel(), start.states), bounds)
+
+
+def _descended(model: FieldModel, mixing: Mixing, here: _Trial, bounds: Bounds) -> _Trial:
     for _ in range(ITERATIONS):
         better = _stepped(model, mixing, here, bounds)
         if better is None:
@@ -168,7 +220,7 @@ def _searched(model: FieldModel, mixing: Mixing, start: Point, bounds: Bounds) -
         gain, here = here.value - better.value, better
         if gain < ENOUGH:
             break
-    return mixing, here
+    return here
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -300,13 +352,13 @@ def _with_covariance(model: FieldModel, mixing: Mixing, found: _Trial) -> Refine
         raise ConvergenceError("the data do not determine the moduli of regions and their borders together") from error
     borders, of_cell = mixing.borders.with_moves(moves), model.zones.of_cell.copy()
     unknown = of_cell != KNOWN
-    share = mixing.fractions(moves)[0]
-    of_zone = np.where(share.sum(axis=1) > 0.5, share.argmax(axis=1) + 1, 0)
-    for region in range(1, share.shape[1] + 1):  # what is smaller than half a cell keeps the cell in which most of it lies
+    share = mixing.shares(moves)
+    of_zone = np.where(share[:, 0] < 0.5, share[:, 1:].argmax(axis=1) + 1, 0)
+    for region in range(1, share.shape[1]):  # what is smaller than half a cell keeps the cell in which most of it lies
         if not (of_zone == region).any():
-            of_zone[share[:, region - 1].argmax()] = region
+            of_zone[share[:, region].argmax()] = region
     of_cell[unknown] = of_zone[of_cell[unknown]]
     zones = replace(joined(model.zones, of_zone), of_cell=of_cell)
-    parts = np.zeros((len(of_cell), share.shape[1] + 1))
-    parts[unknown] = np.column_stack([1.0 - share.sum(axis=1), share])[model.zones.of_cell[unknown]]
+    parts = np.zeros((len(of_cell), share.shape[1]))
+    parts[unknown] = share[model.zones.of_cell[unknown]]
     return RefinedRegions(zones, borders, theta, point, whole, part, found.value, parts, mixing)
