@@ -7,8 +7,9 @@ multiplier p' of the nodes at the end of the step before the pressure is ``p = m
 :cite:p:`simo1992` whose multiplier lives at the nodes, as far as the indenter covers what lies around them. An indenter that is large
 beside the faces thus leaves hardly any penetration; to a small one the foundation yields, as the solid does between the nodes. Friction
 follows by a return mapping of ``t0 - k_t h (slip velocity)`` to ``|t| <= mu p``. In a pass, points in contact have the pressure and the
-friction that are linear in the velocity, the latter with the ratio of the return mapping of the pass before: the matrix stays symmetric
-and positive, and no friction turns a point round.
+friction that are linear in the velocity: the latter with the ratio of the return mapping of the pass before, and where a point goes on
+sliding the way it slid, with the derivative of the return mapping at that pressure, which does not resist along the slip. The matrix
+stays symmetric and positive; where friction turns a point round, it is taken as viscous for the rest of the step.
 """
 
 from __future__ import annotations
@@ -29,11 +30,12 @@ LEAST_FACING = 0.01
 # of the width of a cell times what the slope changes by over it: mean gap over that at the point, beside the lowest point of an indenter;
 # and by how much earlier a cell begins to be covered than it is, so that it is not so at once
 BESIDE, EARLY = 1.0 / 24.0, 1.0 / 16.0
+STRAIGHT = 0.5  # cosine of the angle between the frictions of two passes below which a point turns
 NEAR = 0.1  # of the width of a cell that looks at a flat indenter: it has what is as near as that
 UPRIGHT = 0.75  # width of the cells of a face that stands upright on an indenter: Gauss points lie nearer to its edge than they are wide
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
-# velocity of the indenter, fraction of the cell that is covered
-NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, COLUMNS = 0, 3, 4, 7, 8, 9, 12, 13
+# velocity of the indenter, covered fraction of the cell, unit vector of friction that slides, drag missing along it, whether that turned
+NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, ALIGNED, SLACK, TURNED, COLUMNS = 0, 3, 4, 7, 8, 9, 12, 13, 16, 17, 18
 # columns of what it exerts: force, friction, pressure, covered fraction, pressure besides the multiplier, fraction that a flat indenter
 # has near
 FORCE, TANGENT, ALONG, TOUCHING, OWN, UNDER, RESULTS = 0, 3, 6, 7, 8, 9, 10
@@ -180,7 +182,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             else:
                 gap = _primitive_gap(kind, size, turn, d, q, m, n, none)
             if begins:
-                linear[p, ACTIVE] = 0.0
+                linear[p, ACTIVE:] = 0.0
             carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
             if linear[p, ACTIVE] == 0.0:
                 if found[p, TOUCHING] != 0.0:
@@ -347,7 +349,7 @@ def _open(own, n, motion, k, d, slip):  # type: ignore[no-untyped-def]  # pragma
         slip[a] -= own[SURFACE + a]
         away += slip[a] * n[a]
         own[FRICTION + a] = 0.0
-    own[DRAG] = 0.0
+    own[DRAG], own[SLACK] = 0.0, 0.0
     for a in range(3):
         slip[a] -= away * n[a]
     return away
@@ -361,10 +363,12 @@ def exerted(own, slip, result):  # type: ignore[no-untyped-def]  # pragma: no co
     away = 0.0
     for a in range(3):
         away += own[NORMAL + a] * (slip[a] - own[SURFACE + a])
-    pressure = own[PRESSURE] - own[STIFF] * away
+    pressure, along = own[PRESSURE] - own[STIFF] * away, 0.0
+    for a in range(3):
+        along += own[ALIGNED + a] * (slip[a] - own[SURFACE + a])
     for a in range(3):
         tangential = slip[a] - own[SURFACE + a] - away * own[NORMAL + a]
-        result[TANGENT + a] = own[FRICTION + a] - own[DRAG] * tangential
+        result[TANGENT + a] = own[FRICTION + a] - own[DRAG] * tangential + own[SLACK] * along * own[ALIGNED + a]
         result[FORCE + a] = pressure * own[NORMAL + a] + result[TANGENT + a]
     result[ALONG], result[TOUCHING] = pressure, own[ACTIVE]
 
@@ -373,20 +377,26 @@ def exerted(own, slip, result):  # type: ignore[no-untyped-def]  # pragma: no co
 def _return_mapping(own, traction, slip, stiff, pressure, friction, slid, p, result):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set the linear friction of a point that slips with the velocity `slip`; return how much it differs from that exerted, kPa."""
     along = traction[0] * own[NORMAL] + traction[1] * own[NORMAL + 1] + traction[2] * own[NORMAL + 2]
-    size = 0.0
+    size, same, known, moved = 0.0, 0.0, 0.0, 0.0
     for a in range(3):
         own[FRICTION + a] = traction[a] - along * own[NORMAL + a]
-        size += (own[FRICTION + a] - stiff * slip[a]) ** 2
+        trial = own[FRICTION + a] - stiff * slip[a]
+        size, same, moved = size + trial**2, same + trial * own[ALIGNED + a], moved + trial * slip[a]
+        known += own[ALIGNED + a] ** 2
     size = np.sqrt(size)
     if not slid[p] and size > friction[0] * pressure:
         slid[p] = True
     limit = (friction[1] if slid[p] else friction[0]) * pressure
     ratio = limit / size if size > limit else 1.0
     own[DRAG] = ratio * stiff
+    own[TURNED] = 1.0 if known > 0.0 and same < STRAIGHT * size else own[TURNED]
+    own[SLACK] = own[DRAG] if known > 0.0 and ratio < 1.0 and own[TURNED] == 0.0 else 0.0
     wrong = 0.0
     for a in range(3):
+        own[ALIGNED + a] = (own[FRICTION + a] - stiff * slip[a]) / size if ratio < 1.0 else 0.0
         own[FRICTION + a] *= ratio
         wrong += (own[FRICTION + a] - own[DRAG] * slip[a] - result[TANGENT + a]) ** 2
+        own[FRICTION + a] -= own[SLACK] * moved / max(size, 1e-300) * own[ALIGNED + a]
     return np.sqrt(wrong)
 
 
@@ -412,14 +422,17 @@ def assemble(count, step, surface, lists, linear, right, operator, d):  # type: 
             if not touched:
                 touched = True
                 block[:] = 0.0
-            normal, drag, impulse = own[STIFF], own[DRAG], step * weights[p]
+            normal, drag, slack, impulse = own[STIFF], own[DRAG], own[SLACK], step * weights[p]
             along = own[NORMAL] * own[SURFACE] + own[NORMAL + 1] * own[SURFACE + 1] + own[NORMAL + 2] * own[SURFACE + 2]
+            moved = slack * (own[ALIGNED] * own[SURFACE] + own[ALIGNED + 1] * own[SURFACE + 1] + own[ALIGNED + 2] * own[SURFACE + 2])
+            pressure = own[PRESSURE] + (normal - drag) * along
             for a in range(3):
-                given = (own[PRESSURE] + (normal - drag) * along) * own[NORMAL + a] + own[FRICTION + a] + drag * own[SURFACE + a]
+                given = pressure * own[NORMAL + a] + own[FRICTION + a] + drag * own[SURFACE + a] - moved * own[ALIGNED + a]
                 for c in range(4):
                     right[a * pad + corners[f, c]] += impulse * shape[c] * given
                 for b in range(3):
                     d[a, b] = impulse * ((normal - drag) * own[NORMAL + a] * own[NORMAL + b] + (drag if a == b else 0.0))
+                    d[a, b] -= impulse * slack * own[ALIGNED + a] * own[ALIGNED + b]
             for c in range(4):
                 for e in range(c + 1):
                     both = shape[c] * shape[e]
