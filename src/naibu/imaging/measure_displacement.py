@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from itertools import permutations
 from typing import Literal, get_args
 
 import numpy as np
@@ -34,7 +35,7 @@ from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_gr
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.preprocessing.volume_pair import require_known
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
-from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts
+from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts, doubt_beside
 from naibu.imaging.volume_correlation.results.block_displacements import LEFT
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 
@@ -292,7 +293,12 @@ def _correlated(
         return measured_by(found, reference, inside)
     rest = inside & ~np.logical_or.reduce([part for part, _ in parts])
     each = [*parts, (rest, found)] if rest.any() else parts
-    return _joined([measured_by(own, reference, part) for part, own in each], len(parts), inside)
+    joined = _joined([measured_by(own, reference, part) for part, own in each], len(parts), inside)
+    if joined.displacement.covariance is not None:
+        for one, other in permutations(each, 2):
+            at, doubt = doubt_beside(one, other)
+            joined.displacement.covariance[at] += doubt
+    return joined
 
 
 def _joined(measured: Sequence[MeasuredDisplacement], own: int, inside: BoolArray) -> MeasuredDisplacement:

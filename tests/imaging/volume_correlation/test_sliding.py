@@ -8,9 +8,10 @@ import pytest
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.volume import Volume
 from naibu.imaging.measure_displacement import measure_displacement
+from naibu.imaging.preprocessing.intensity_parts import intensity_parts
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
-from naibu.imaging.volume_correlation.part_by_part import correlated_parts, with_own_field
+from naibu.imaging.volume_correlation.part_by_part import correlated_parts, doubt_beside, jump_fraction, with_own_field
 from naibu.validation.scanners.textures import Texture
 
 SHAPE, SPACING_MM, SLIDE_MM = (44, 52, 60), (1.0, 1.0, 1.0), 6.0
@@ -93,6 +94,41 @@ def test_parts_that_differ_in_intensity_are_measured_by_themselves() -> None:
 def test_an_object_that_moves_as_one_is_measured_as_one() -> None:
     before, after, _, ball = scans(0.0, upper=500.0)
     assert "parts" not in measure_displacement(before, after, mask=ball).facts
+
+
+def test_a_small_slide_is_seen_where_the_fields_of_parts_differ() -> None:
+    """One field leaves nothing of it further apart than a voxel."""
+    before, after, truth, ball = scans(2.0, upper=300.0)
+    found = measure_displacement(before, after, mask=ball)
+    assert found.facts["parts"] == 2
+    # on either side of the surface a voxel is half of the one part and half of the other: regions hold either
+    beside = ball & (np.abs(positions(before)[..., 2] - MIDDLE_MM[2]) < 1.0) & found.displacement.valid
+    error, covariance = (found.displacement.vectors - truth)[beside], found.displacement.covariance[beside]
+    held = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]) < CHI_SQUARED_95
+    assert held.mean() > 0.9
+
+
+def test_parts_that_move_as_one_do_not_jump_and_what_jumps_is_in_doubt_beside_it() -> None:
+    fields = {}
+    for slide_mm in (0.0, SLIDE_MM):
+        before, after, _, ball = scans(slide_mm, upper=300.0)
+        parts = intensity_parts(before, ball)
+        fields[slide_mm] = [(part, correlate_volumes(before, after, mask=part)) for part in parts]
+    assert jump_fraction(*fields[0.0]) < 0.02
+    assert jump_fraction(*fields[SLIDE_MM]) > 0.5
+    (part, _), (other, _) = fields[SLIDE_MM]
+    at, doubt = doubt_beside(*fields[SLIDE_MM])
+    assert part[at].all() and not other[at].any()
+    assert other[np.maximum(at[0] - 1, 0), at[1], at[2]].mean() + other[at[0] + 1, at[1], at[2]].mean() > 0.9  # a layer of one voxel
+    # a quarter of the square of the slide, along it
+    assert np.median(doubt[:, 0, 0]) == pytest.approx(0.25 * SLIDE_MM**2, rel=0.1)
+    assert np.median(doubt[:, 1, 1]) < 0.1
+
+
+def test_parts_that_jump_keep_their_own_field() -> None:
+    """But for one that has lost its way by more than a little."""
+    assert with_own_field([(1.0, 1.0), (0.9, 1.0)], jumping=True) == [True, True]
+    assert with_own_field([(0.5, 0.1), (2.1, 1.0)], jumping=True, little_mm=0.6) == [True, False]
 
 
 @pytest.mark.parametrize(

@@ -161,8 +161,12 @@ class CorrelationResult:
     @property
     def misplaced_fraction(self) -> float:
         """Fraction of the cells in the object where structures stay more than a voxel apart after registration."""
+        return self.apart_fraction(1.0)
+
+    def apart_fraction(self, voxels: float) -> float:
+        """Return the fraction of the cells in the object where structures stay further apart than some voxels after registration."""
         known = self.cell_misplacement[np.isfinite(self.cell_misplacement)]
-        return float((known > float(np.prod(self.volume.spacing_mm)) ** (2.0 / 3.0)).mean())
+        return float((known > voxels**2 * float(np.prod(self.volume.spacing_mm)) ** (2.0 / 3.0)).mean())
 
     def misplacement_at(self, points_mm: ArrayLike) -> FloatArray:
         """Return `cell_misplacement` (n,), mm^2, at positions (n, 3), mm; NaN away from the object."""
