@@ -127,3 +127,28 @@ def test_compilation_leaves_the_search_for_cycles_as_it_was(collecting: bool) ->
         assert gc.isenabled() == collecting
     finally:
         gc.enable() if before else gc.disable()
+
+
+def test_a_kernel_is_compiled_once_for_all_constants_that_it_is_called_with() -> None:
+    @njit
+    def chosen(x, k):  # type: ignore[no-untyped-def]
+        return x + k
+
+    @njit
+    def calls(x):  # type: ignore[no-untyped-def]
+        return chosen(x, 0) + chosen(x, 1) + chosen(x, int(x)) + chosen(x, k=2)
+
+    assert calls(2.0) == 13.0
+    assert len(chosen.signatures) == 1
+
+
+def test_a_kernel_that_takes_an_item_of_a_tuple_by_a_constant_gets_it() -> None:
+    @njit
+    def item(pair, k):  # type: ignore[no-untyped-def]
+        return pair[k]
+
+    @njit
+    def calls(x):  # type: ignore[no-untyped-def]
+        return item((x, "text"), 0) + len(item((x, "text"), 1))
+
+    assert calls(2.5) == 6.5

@@ -54,6 +54,8 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
         # one function may be compiled both ways: machine code of the same name would be taken for the same
         compiled = numba.njit(**options)(named_apart(function, "__parallel") if options.get("parallel") else function)
         compiler = getattr(compiled, "_compiler", None)  # None where NUMBA_DISABLE_JIT is set, or on an untested Numba
+        if compiler is not None and hasattr(compiled, "get_call_template"):
+            compiled.get_call_template = _Calls(compiled.get_call_template)
         if cache and compiler is not None and hasattr(compiler, "compile"):
             compiler.compile = CachedCompiler(compiled, compiler.compile)
             if called_apart():
@@ -61,6 +63,27 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
         return compiled
 
     return decorated if function is None else decorated(function)
+
+
+class _Calls:
+    """What tells the type of a call of a kernel by another one: that of its arguments, not of constants among them.
+
+    Numba compiles a kernel once more for each constant that it is called with, an eighth of the time of compilation where it was measured;
+    once the kernel is part of its caller, the optimiser knows the constant in any case. A kernel that takes an item of a tuple of several
+    types by a constant needs it, and gets it.
+    """
+
+    def __init__(self, template: Callable[[Any, Any], Any]) -> None:
+        self._template = template
+
+    def __call__(self, args: Any, named: Any) -> Any:
+        plain = tuple(map(numba.types.unliteral, args)), {name: numba.types.unliteral(value) for name, value in named.items()}
+        try:
+            return self._template(*plain)
+        except numba.core.errors.TypingError:
+            if plain == (tuple(args), dict(named)):
+                raise
+            return self._template(args, named)
 
 
 class CachedCompiler:
