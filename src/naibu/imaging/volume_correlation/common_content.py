@@ -6,14 +6,15 @@ which needs the noise to be known: the image intensity gradients of both volumes
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray
 from naibu.core.errors import InputError
-from naibu.imaging.volume_correlation._warp_kernels import add_to_cells
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 
 # correlation of the image intensity gradients of the registered volumes, below which nothing was matched: two volumes of noise or of
@@ -118,17 +119,18 @@ def common_content(fit: CorrelationFit, depth_mm: Float32Array) -> CommonContent
 def content_sums(fit: CorrelationFit, depth_mm: Float32Array) -> FloatArray:
     """Return sums (m, 13) over the voxels of every cell, from which `content_of` follows."""
     inside = depth_mm > SURFACE * float(fit.system.grid.step_mm.mean())
-    traces = np.stack([fit.agreement[:, axes].sum(axis=1) for axes in ([0, 3, 5], [6, 9, 11])], axis=1)
+    common, own = (fit.agreement[:, axes].sum(axis=1) for axes in ([0, 3, 5], [6, 9, 11]))
     # steep edges show an outline, also that of another object: they count by the jitter of the settings, however well they fit
-    voxel, precision = float(fit.level.spacing.mean()), fit.residual_sd**-2 * traces[:, 1] / np.maximum(fit.weight, 1e-30)
-    lower = (1 + (fit.jitter_voxels * voxel) ** 2 * precision) / (1 + (fit.settings.jitter_sd_voxels * voxel) ** 2 * precision)
-    traces *= lower[:, None]
-    every = np.column_stack([traces, np.ones(len(traces))])
+    voxel, precision = np.float32(fit.level.spacing.mean()), np.float32(fit.residual_sd**-2) * own / np.maximum(fit.weight, 1e-30)
+    sds = (np.float32(sd) * voxel for sd in (fit.jitter_voxels, fit.settings.jitter_sd_voxels))
+    observed, stated = (1 + sd**2 * precision for sd in sds)
+    lower = observed / stated
+    every = common * lower, own * lower, np.ones_like(lower)
     residual = fit.residual * np.sqrt(fit.weight * lower)
-    columns = [*every.T, *(every * inside[:, None]).T, _lagged(fit, residual, residual), residual**2, *_lagged_intensities(fit)]
-    sums = np.zeros((len(fit.system.cells), len(columns)))
-    add_to_cells(fit.cell_of_voxel, np.stack(columns, axis=1), sums)
-    return sums
+    # one by one: as large as the voxels' list, all of them together would be the most memory that is needed at a time
+    alike = _lagged(fit, residual, residual), residual**2
+    columns = chain(every, (v * inside for v in every), alike, _lagged_intensities(fit))
+    return np.stack([fit.cell_sums(v) for v in columns], axis=1)
 
 
 def content_of(fit: CorrelationFit, cells: FloatArray) -> CommonContent:
@@ -164,14 +166,14 @@ def unlike_cells(fit: CorrelationFit, lagged: FloatArray) -> BoolArray:
     return np.asarray(dense[at] | (near & (left > LEAST_BESIDE) & (left > BESIDE * shown)))
 
 
-def _lagged_intensities(fit: CorrelationFit) -> list[Float32Array]:
-    """Return mean products (n,) with the voxels LAG further: of residuals, intensities, their first and second factor, and of ones."""
+def _lagged_intensities(fit: CorrelationFit) -> Iterator[Float32Array]:
+    """Give mean products (n,) with the voxels LAG further: of residuals, intensities, their first and second factor, and of ones."""
     seen = fit.seen.astype(np.float32)
     # about their mean, which does not matter but for rounding
     intensity = seen * (fit.level.intensity - fit.level.intensity.mean()) / np.float32(fit.residual_sd)
     residual = seen * fit.residual / np.float32(fit.residual_sd)
-    pairs = ((residual, residual), (intensity, intensity), (intensity, seen), (seen, intensity), (seen, seen))
-    return [_lagged(fit, *pair) for pair in pairs]
+    for pair in ((residual, residual), (intensity, intensity), (intensity, seen), (seen, intensity), (seen, seen)):
+        yield _lagged(fit, *pair)
 
 
 def _lagged(fit: CorrelationFit, values: Float32Array, others: Float32Array) -> Float32Array:

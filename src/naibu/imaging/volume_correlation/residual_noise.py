@@ -80,9 +80,13 @@ def lagged_products(mask: BoolArray, weighted: Float32Array) -> tuple[AnyFloatAr
 
 def amplitude_of(products: AnyFloatArray, pairs: AnyFloatArray) -> Float32Array:
     """Return the amplitudes of a Fourier transform with the autocorrelation of `lagged_products`, whose size is that of the field."""
-    lag = [np.minimum(np.arange(n), n - np.arange(n)) for n in products.shape]
-    near = np.exp(-0.5 * sum(np.meshgrid(*[(g / CORRELATED) ** 2 for g in lag], indexing="ij")))
-    correlation = products / np.maximum(pairs, 0.05 * pairs[0, 0, 0]) * near
+    # the numbers are as exact as the products, which are of single precision, too
+    correlation = np.maximum(pairs, 0.05 * pairs[0, 0, 0])
+    np.divide(products, correlation, out=correlation)
+    for axis, n in enumerate(products.shape):
+        lag = np.minimum(np.arange(n), n - np.arange(n))
+        near = np.exp(-0.5 * (lag / CORRELATED) ** 2).astype(correlation.dtype)
+        correlation *= near.reshape([-1 if a == axis else 1 for a in range(3)])
     return np.asarray(np.sqrt(np.maximum(fft.rfftn(correlation, workers=2).real, 0)), dtype=np.float32)
 
 

@@ -303,6 +303,17 @@ def collected(
     residuals tell of structures that no smooth field brings together, such as those on either side of organs that slide on each other.
     """
     system, level = fit.system, fit.level
+    # the errors first: they take memory for every voxel of the object, and the fields below stay
+    bias = biases(fit, c, bending, dilatation)
+    remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
+    misplaced = misplacement_variance(fit, misfit, content.unlike)
+    biased = bias_variance(fit, bias) + hidden[0]
+    variance = biased + remaining + misplaced
+    spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
+    covariance = per_cell(system.grid, fit, spread)
+    strain_sd = np.sqrt(
+        strain_variance(fit, c, samples, bias) + hidden[1] + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
+    )
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
     valid = np.zeros(volume.shape, dtype=bool)
     inside = level.mask.copy()
@@ -326,16 +337,6 @@ def collected(
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
         full[~valid] = np.nan
-    bias = biases(fit, c, bending, dilatation)
-    remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
-    misplaced = misplacement_variance(fit, misfit, content.unlike)
-    biased = bias_variance(fit, bias) + hidden[0]
-    variance = biased + remaining + misplaced
-    spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
-    covariance = per_cell(system.grid, fit, spread)
-    strain_sd = np.sqrt(
-        strain_variance(fit, c, samples, bias) + hidden[1] + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
-    )
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     of_strain, of_bias, of_place, bent, dilated = (
