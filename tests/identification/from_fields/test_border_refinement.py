@@ -155,6 +155,11 @@ def test_lumps_are_of_one_material_where_the_data_do_not_tell_their_moduli_apart
     truth = np.array([5.0, 12.0, other])[:regions]
     off = np.abs(np.log(young_and_poisson(found.theta)[0] / truth))
     assert (off < 3.0 * np.sqrt(np.diag(found.covariance))[:regions]).all()
+    if regions == 2:  # of the lumps, joined, the interval reaches to what each was by itself
+        joined_moduli = np.outer([False, True, False, True], [False, True, False, True])
+        np.testing.assert_array_equal(found.apart != 0.0, joined_moduli)
+    else:
+        assert not found.apart.any()
 
 
 def _two_lumps(*radii_mm: float) -> tuple[FieldModel, np.ndarray]:
@@ -225,4 +230,6 @@ def refined_borders_at(fields: FieldModel, borders: Borders) -> RefinedRegions:
     """Return regions with these borders, before any search."""
     mixing = Mixing.of(fields, borders)
     nothing = np.zeros((4, 4))
-    return RefinedRegions(fields.zones, mixing.borders, np.zeros(4), _homogeneous(fields), nothing, nothing, 0.0, np.zeros((0, 2)), mixing)
+    return RefinedRegions(
+        fields.zones, mixing.borders, np.zeros(4), _homogeneous(fields), nothing, nothing, nothing, 0.0, np.zeros((0, 2)), mixing
+    )

@@ -376,7 +376,7 @@ class _Recipe:
         shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
         if refined is not None:
-            of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders))
+            of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders)).with_added(refined.apart)
         on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
         of_known = covariance_of(others := assumptions(at, quadratic, self.law, stretch, self.borders), len(theta))
         judged, names = verdict(model.observed, residuals, freedom), model.zones.names

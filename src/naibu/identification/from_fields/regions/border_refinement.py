@@ -54,6 +54,8 @@ class RefinedRegions:
         The fit, cell by cell.
     covariance, at_these_borders : ndarray, shape (2 regions, 2 regions)
         Of theta, for independent noise: with the borders unknown, and as if they were known.
+    apart : ndarray, shape (2 regions, 2 regions)
+        Mean square by which moduli of the pieces of a region, each by itself, differed from those that they share, besides.
     objective : float
         Half of chi squared and priors.
     parts : ndarray, shape (m, regions)
@@ -68,6 +70,7 @@ class RefinedRegions:
     point: Point
     covariance: FloatArray
     at_these_borders: FloatArray
+    apart: FloatArray
     objective: float
     parts: FloatArray
     mixing: Mixing
@@ -88,7 +91,8 @@ def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, 
 
     Moduli of whole cells depend on how many of these a lump happened to get, so that two lumps of one material look different; only with
     free borders do the data tell. Regions are joined as one piece, which spares two moduli and a location, or as pieces with a border each
-    that share their moduli, which spares the moduli: whichever lowers the criterion of the segmentation more.
+    that share their moduli, which spares the moduli: whichever lowers the criterion of the segmentation more. What the criterion does not
+    tell apart may still differ by several standard deviations of precise data: `RefinedRegions.apart` holds by how much.
 
     Parameters
     ----------
@@ -132,25 +136,33 @@ def _of_one_material(model: FieldModel, found: RefinedRegions, bounds: Bounds) -
     where there are no two, or no equilibrium with the same moduli in both.
     """
     k = found.zones.count
-    pairs = list(combinations(range(1, k), 2))
     precision = np.linalg.inv(found.covariance)
     ends = []
-    for a, b in pairs:
-        gather = np.kron(np.eye(2), np.delete(np.eye(k) + np.outer(np.eye(k)[b], np.eye(k)[a]), b, axis=1))
-        theta = np.linalg.solve(gather.T @ precision @ gather, gather.T @ precision @ found.theta)
-        apart = found.theta - gather @ theta
-        ends.append((float(apart @ precision @ apart), a, b, theta))
+    for a, b in combinations(range(1, k), 2):
+        gather = _gathered(np.where(np.arange(k) == b, a, np.arange(k)) - (np.arange(k) > b))
+        theta = np.asarray(np.linalg.solve(gather.T @ precision @ gather, gather.T @ precision @ found.theta), dtype=float)
+        away = found.theta - gather @ theta
+        ends.append((float(away @ precision @ away), a, b, theta, gather))
     if not ends:
         return []
-    _, a, b, theta = min(ends, key=lambda e: e[0])
-    of_piece = found.mixing.borders.region_of_piece
-    of_piece = np.where(of_piece == b, a, of_piece)
-    mixing = replace(found.mixing, borders=replace(found.mixing.borders, region_of_piece=of_piece - (of_piece > b)))
+    _, a, b, theta, gather = min(ends, key=lambda e: e[0])
+    region = gather[:k, : k - 1].argmax(axis=1)
+    borders = replace(found.mixing.borders, region_of_piece=region[found.mixing.borders.region_of_piece])
+    mixing = replace(found.mixing, borders=borders)
     try:
         start = _Trial.at(model, mixing, Objective(bounds=bounds).clipped(theta), found.borders.moves.ravel(), found.point.states)
-        return [(a, b, _with_covariance(model, mixing, _descended(model, mixing, start, bounds)))]
+        one = _with_covariance(model, mixing, _descended(model, mixing, start, bounds))
     except ConvergenceError:
         return []
+    away = found.theta - gather @ one.theta
+    pieces = [away * np.tile(np.arange(k) == piece, 2) for piece in (a, b)]
+    apart = np.mean([np.outer(gather.T @ piece, gather.T @ piece) for piece in pieces], axis=0)
+    return [(a, b, replace(one, apart=gather.T @ found.apart @ gather + apart))]
+
+
+def _gathered(region: IntArray) -> FloatArray:
+    """Return the matrix (2 before, 2 after) that gives both moduli of every region before from those of the `region` that it became."""
+    return np.asarray(np.kron(np.eye(2), np.eye(int(region.max()) + 1)[region]))
 
 
 def _within_one_border(
@@ -171,7 +183,11 @@ def _within_one_border(
         of_pieces = np.unique(of_pieces, return_inverse=True)[1].ravel().astype(np.int64)
         start = replace(near, theta=np.concatenate([mean, ratio]))
         with contextlib.suppress(ConvergenceError):  # regions that are too different to be one; others may be joined
-            yield new, of_pieces, refined_borders(model, joined(model.zones, new), start, bounds, joined(model.zones, of_pieces))
+            one = refined_borders(model, joined(model.zones, new), start, bounds, joined(model.zones, of_pieces))
+            became = np.zeros(found.zones.count, dtype=np.int64)
+            became[labels] = new
+            gather = _gathered(became)
+            yield new, of_pieces, replace(one, apart=gather.T @ found.apart @ gather)
 
 
 def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bounds, pieces: Zones | None = None) -> RefinedRegions:
@@ -361,4 +377,4 @@ def _with_covariance(model: FieldModel, mixing: Mixing, found: _Trial) -> Refine
     zones = replace(joined(model.zones, of_zone), of_cell=of_cell)
     parts = np.zeros((len(of_cell), share.shape[1]))
     parts[unknown] = share[model.zones.of_cell[unknown]]
-    return RefinedRegions(zones, borders, theta, point, whole, part, found.value, parts, mixing)
+    return RefinedRegions(zones, borders, theta, point, whole, part, np.zeros_like(whole), found.value, parts, mixing)
