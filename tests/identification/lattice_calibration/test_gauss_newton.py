@@ -92,13 +92,10 @@ def test_the_truth_lies_within_the_intervals(lattice: Lattice, capture: Capture,
         assert np.sqrt(np.diag(found.covariance)).max() < 0.05
 
 
-@pytest.mark.parametrize("index", ["shape", "force"])
-def test_intervals_come_from_derivatives_at_the_estimate(
-    lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns, index: Index
-) -> None:
-    """Not from those that the steps of the search improved; relative to their trace, as the noise may be taken as larger."""
-    problem = CalibrationProblem.of(lattice, [capture], unknowns, index=index)
-    found = calibrate_lattice(problem, START)
+def test_intervals_come_from_derivatives_at_the_estimate(lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:
+    """Not from those that steps of the search improved, 2 % off here; relative to their trace, as the noise may be taken as larger."""
+    problem = CalibrationProblem.of(lattice, [capture], unknowns, index="shape")
+    found = calibrate_lattice(problem, {"K": 20.0, "C1": 100.0, "C2": 400.0})
     expected = evaluated(problem, np.log(found.values)).information
     np.testing.assert_allclose(found.information / np.trace(found.information), expected / np.trace(expected), rtol=1e-6)
 
