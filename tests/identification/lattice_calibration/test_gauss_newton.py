@@ -92,6 +92,14 @@ def test_the_truth_lies_within_the_intervals(lattice: Lattice, capture: Capture,
         assert np.sqrt(np.diag(found.covariance)).max() < 0.05
 
 
+def test_intervals_come_from_derivatives_at_the_estimate(lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:
+    """Not from those that steps of the search improved, 2 % off here; relative to their trace, as the noise may be taken as larger."""
+    problem = CalibrationProblem.of(lattice, [capture], unknowns, index="shape")
+    found = calibrate_lattice(problem, {"K": 20.0, "C1": 100.0, "C2": 400.0})
+    expected = evaluated(problem, np.log(found.values)).information
+    np.testing.assert_allclose(found.information / np.trace(found.information), expected / np.trace(expected), rtol=1e-6)
+
+
 def test_a_search_from_values_near_by_ends_where_the_long_one_does(lattice: Lattice, capture: Capture, unknowns: LatticeUnknowns) -> None:
     problem = CalibrationProblem.of(lattice, [capture], unknowns)
     far = calibrate_lattice(problem, START)

@@ -24,8 +24,8 @@ class LatticeEstimate:
     values : ndarray, shape (p,)
         mN/mm and mN s/mm.
     covariance : ndarray, shape (p, p)
-        Of their logarithms; weak priors around the start included. Widened to where chi-squared itself rises along the least determined
-        combinations.
+        Of their logarithms; weak priors around the start included. Widened to where chi-squared itself rises by its 95 % quantile as a
+        parameter changes and all others are fitted again (not in contact).
     information : ndarray, shape (p, p)
         Fisher information of the data alone.
     noise_factor : tuple of float

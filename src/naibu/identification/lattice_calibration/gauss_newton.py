@@ -217,8 +217,8 @@ def calibrate_lattice(
     warm_start : array_like or mapping, optional
         Values from which the search begins, as the estimate of a similar problem; weak priors stay around `start`. By default `start`.
     widen : bool
-        Whether the covariance is widened to where chi-squared itself rises, which takes some thirty simulations of each load case;
-        not of differences of simulations, as in contact.
+        Whether the covariance is widened to where chi-squared itself rises, all others fitted again, which takes derivatives once
+        more and, of nine parameters, some forty simulations of each load case; not of differences of simulations, as in contact.
     threads : int
         Into how many parts the derivatives of every capture are shared; by default as many threads compute them.
     executor : concurrent.futures.Executor
@@ -267,7 +267,10 @@ def _searched(
         at.keep(here, point)
     point, used = _corrected(here, point, prior, most, at)
     count += used
-    covariance = widened_covariance(here, point, centre, prior_sd, at)[0] if widen else covariance_at(point, prior_sd)
+    if not widen:
+        return _estimate(here, point, covariance_at(point, prior_sd), count, at.runs)
+    point = replace(point, slopes=at(here, point.theta).slopes)
+    covariance = widened_covariance(here, point, centre, prior_sd, at)[0]
     return _estimate(here, point, covariance, count, at.runs)
 
 

@@ -1,87 +1,107 @@
-"""Covariance of lattice parameters, widened to where chi-squared itself rises :cite:p:`venzon1988`."""
+"""Covariance of lattice parameters, widened to the ends of their profile likelihood :cite:p:`venzon1988`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint
+from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
-from naibu.identification.lattice_calibration.least_squares import SETTLED, Evaluations, cost_at, cost_of
+from naibu.identification.lattice_calibration.least_squares import Evaluations, cost_at, cost_of
+from naibu.identification.lattice_calibration.residual_model import RISE, ResidualModel
 
-FARTHEST = 0.7  # change of a logarithm to where chi-squared is looked at
-PROFILED = 4  # combinations along which it is
-FITTED_AGAIN = 4  # simulations at each end, at most
-WIDEST = 3.0  # factor of standard deviations
+FARTHEST = 0.7  # change of a logarithm to where chi-squared is followed
+WEAK = 4  # combinations along which residuals curve
+NEAR = 0.3  # relative change of values at which that is looked at, at most
+LEAST_FACTOR = 0.3  # by which it makes a value smaller, at most
+ROUNDS = 4  # simulations of an end, at most
+MET = 0.03  # of RISE, within which a simulation must confirm it
+WIDEST = 3.0  # times farther than what was simulated, at most
+QUANTILE = 1.96
 
 
 @dataclass(slots=True)
 class _End:
-    """An end of the interval of a combination: where chi-squared is looked at, the least that was found, and what may still move."""
+    """An end of the interval of parameter k: where it is sought, and what residuals there differ by from those of the model."""
 
-    variance: float
+    k: int
     reach: float
-    others: FloatArray
-    theta: FloatArray
-    lowest: float
     at: FloatArray
-    fitting: bool = True
+    offset: FloatArray | None = None
+    rise: float = 0.0
+
+    @property
+    def met(self) -> bool:
+        return abs(self.rise - RISE) < MET * RISE
+
+    def distance(self, theta: FloatArray) -> float:
+        """Return how far the logarithm goes from theta (p,), as chi-squared rose; no less than sought, unless a simulation confirms it."""
+        further = np.sqrt(RISE / max(self.rise, RISE / WIDEST**2))
+        return float(abs(self.at[self.k] - theta[self.k]) * (further if self.met else max(further, 1.0)))
 
 
 def widened_covariance(
-    problem: InverseProblem,
-    point: EvaluatedPoint,
-    centre: FloatArray,
-    prior_sd: float,
-    at: Evaluations,
+    problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations
 ) -> tuple[FloatArray, int]:
-    """Return the covariance at a point, widened along its least determined combinations to where chi-squared says; and the runs.
+    """Return the covariance at a point, widened to where chi-squared rises by its 95 % quantile, all others fitted again; and the runs.
 
-    Combinations of classes are determined by what is nonlinear, and what the data tell of them changes by a factor within their own
-    interval. Each is moved to the ends of its interval, all others are fitted again, and the increase of the cost there tells how far one
-    standard deviation reaches. Derivatives are those of the point; residuals are those of long steps, corrected by what fine steps
-    differ from them at the point.
+    Values that compensate each other lie along a curved valley of chi-squared, which derivatives at its bottom do not tell. How residuals
+    curve along the least determined combinations is told by simulations around the point (`ResidualModel`). The ends of all intervals,
+    along the valley, are sought with that model and simulated; what residuals there differ by is added to those of the model, and the end
+    is sought again, until the simulation confirms it (output space mapping; :cite:t:`bandler2004`). Standard deviations reach the farther
+    end. They are never less than derivatives say.
 
     Parameters
     ----------
     problem : InverseProblem
         With the noise as it was found.
     point : EvaluatedPoint
-        Where the search ended, with residuals of fine steps.
+        Where the search ended, with residuals of fine steps, and derivatives of that very point: those that were improved by steps are
+        off by a percent or two, and along the valley that is too much.
     centre, prior_sd
         Of the weak prior.
     at : Evaluations
         Of residuals.
     """
     covariance = np.asarray(np.linalg.inv(point.information + np.eye(len(point.theta)) / prior_sd**2))
+    before, coarse = at.runs, at.many(problem, [(point.theta, False)])[0]
     values, vectors = np.linalg.eigh(covariance)
-    coarse, runs, fine = at.many(problem, [(point.theta, False)])[0], 1, point.residual
-    least, hessian = cost_of(point, centre, prior_sd), np.linalg.inv(covariance)
-    ends = []
-    for value, vector in list(zip(values, vectors.T, strict=True))[::-1][:PROFILED]:
-        others = np.linalg.svd(vector[None])[2][1:].T
-        reach = min(1.96 * float(np.sqrt(value)), FARTHEST)
-        ends += [_End(float(value), reach, others, point.theta + side * reach * vector, np.inf, point.theta) for side in (-1.0, 1.0)]
-    for _ in range(FITTED_AGAIN):
-        moving = [end for end in ends if end.fitting]
-        for end, found in zip(moving, at.many(problem, [(end.theta, False) for end in moving]), strict=True):
-            runs += 1
-            corrected = (found[0] + fine[0] - coarse[0], found[1] + fine[1] - coarse[1])
-            cost = cost_at(corrected, end.theta, centre, prior_sd)
-            end.fitting = cost < end.lowest - SETTLED
-            if cost < end.lowest:
-                end.lowest, end.at = cost, end.theta
-            if end.fitting:
-                slope = replace(point, residual=corrected).gradient() + (end.theta - centre) / prior_sd**2
-                end.theta = end.theta - end.others @ np.linalg.solve(end.others.T @ hessian @ end.others, end.others.T @ slope)
-    widened = covariance.copy()
+    weak = vectors[:, ::-1][:, :WEAK]
+    model = ResidualModel(point, weak, centre, prior_sd)
+    split, lowest = len(coarse[0]), cost_of(point, centre, prior_sd)
+    fine_less_coarse = np.concatenate(point.residual) - np.concatenate(coarse)
+
+    def simulated(places: list[FloatArray]) -> list[Residual]:
+        found = [np.concatenate(r) + fine_less_coarse for r in at.many(problem, [(place, False) for place in places])]
+        for place, residual in zip(places, found, strict=True):
+            model.learn(place, residual)
+        model.fit()
+        return [(r[:split], r[split:]) for r in found]
+
+    simulated(_around(point.theta, weak * np.minimum(np.sqrt(values[::-1][:WEAK]), NEAR)))
+    reached = QUANTILE * np.sqrt(np.diag(covariance))
+    ends = [_End(k, side * float(reach), point.theta) for k, reach in enumerate(reached) for side in (-1.0, 1.0)]
+    for _ in range(ROUNDS):
+        moving = [end for end in ends if not end.met]
+        if not moving:
+            break
+        bottom, _ = model.cost().fitted(point.theta, np.arange(len(point.theta), dtype=np.int64))
+        for end in moving:
+            end.at = model.cost(end.offset).end(bottom, lowest, end.k, end.reach, FARTHEST)
+        for end, residual in zip(moving, simulated([end.at for end in moving]), strict=True):
+            end.rise = cost_at(residual, end.at, centre, prior_sd) - lowest
+            end.offset = np.concatenate(residual) - model.predicted(end.at)
     for end in ends:
-        deviation = (end.at - point.theta) / np.sqrt(max(end.lowest - least, end.reach**2 / end.variance / WIDEST**2))
-        ratio = float(deviation @ hessian @ deviation)
-        if ratio > 1.0:
-            wider = covariance + (1.0 - 1.0 / ratio) * np.outer(deviation, deviation)
-            factor = np.sqrt(np.maximum(np.diag(wider) / np.diag(widened), 1.0))
-            widened = widened * np.outer(factor, factor)
-    return widened, runs
+        reached[end.k] = max(reached[end.k], end.distance(point.theta))
+    factor = reached / (QUANTILE * np.sqrt(np.diag(covariance)))
+    return covariance * np.outer(factor, factor), at.runs - before
+
+
+def _around(theta: FloatArray, directions: FloatArray) -> list[FloatArray]:
+    """Return logarithms after relative changes of the values: both ways along every direction (p, m), and along every two together."""
+    count = directions.shape[1]
+    steps = [side * d for d in directions.T for side in (-1.0, 1.0)]
+    steps += [np.sqrt(0.5) * (directions[:, i] + directions[:, j]) for i in range(count) for j in range(i)]
+    return [theta + np.log1p(np.maximum(step, LEAST_FACTOR - 1.0)) for step in steps]

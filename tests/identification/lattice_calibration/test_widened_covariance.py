@@ -1,0 +1,97 @@
+"""Intervals along a curved valley of chi-squared against its profile in closed form, and of linear models against least squares."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
+from naibu.identification.lattice_calibration.residual_model import RISE, ResidualModel
+from naibu.identification.lattice_calibration.widened_covariance import widened_covariance
+
+WEAK_PRIOR = 100.0
+
+
+class Sum:
+    """Two values whose sum, 2, is determined by a thousandth, and the logarithm of whose ratio, 0, by `sd` only."""
+
+    def __init__(self, sd: float, offset: float = 0.0):
+        self.sd, self.offset, self.runs = sd, offset, 0
+
+    def residual(self, theta: np.ndarray, *, fine: bool = False) -> Residual:
+        wrong = 0.0 if fine else self.offset
+        return np.array([1e3 * (np.exp(theta).sum() - 2.0) + wrong]), np.array([(theta[0] - theta[1]) / self.sd + wrong])
+
+    def point(self) -> EvaluatedPoint:
+        slopes = (np.array([[1e3, 1e3]]), np.array([[1.0, -1.0]]) / self.sd)
+        return EvaluatedPoint(np.zeros(2), self.residual(np.zeros(2), fine=True), slopes)
+
+    def many(self, _: Any, trials: list[tuple[np.ndarray, bool]]) -> list[Residual]:
+        self.runs += len(trials)
+        return [self.residual(theta, fine=fine) for theta, fine in trials]
+
+
+class Linear:
+    """Residuals that are linear in logarithms."""
+
+    runs = 0
+
+    def __init__(self, slopes: np.ndarray):
+        self.slopes = slopes
+
+    def many(self, _: Any, trials: list[tuple[np.ndarray, bool]]) -> list[Residual]:
+        self.runs += len(trials)
+        return [(self.slopes[:5] @ theta, self.slopes[5:] @ theta) for theta, _ in trials]
+
+
+@pytest.mark.parametrize("sd", [0.1, 0.25, 0.4, 0.5, 0.6])
+@pytest.mark.parametrize("offset", [0.0, 3.0])
+def test_intervals_reach_to_the_end_of_the_profile_along_a_curved_valley(sd: float, offset: float) -> None:
+    """On K1 + K2 = 2 the logarithm d of the ratio rises to 1.96 sd: K1 = 2 / (1 + exp(d)) there; derivatives say exp(-d / 2)."""
+    law = Sum(sd, offset)
+    found, runs = widened_covariance(law, law.point(), np.zeros(2), WEAK_PRIOR, law)  # type: ignore[arg-type]
+    d = np.sqrt(RISE) * sd
+    expected = np.log((1.0 + np.exp(d)) / 2.0)
+    np.testing.assert_allclose(1.96 * np.sqrt(np.diag(found)), expected, rtol=0.02)
+    assert expected > (1.02 if sd < 0.2 else 1.1) * d / 2.0  # what derivatives say is too little
+    assert runs == law.runs < 40
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_both_ends_of_a_profile_are_those_of_its_closed_form(side: float) -> None:
+    law = Sum(0.4)
+    model = ResidualModel(law.point(), np.array([[1.0], [-1.0]]) / np.sqrt(2.0), np.zeros(2), WEAK_PRIOR)
+    d = np.sqrt(RISE) * 0.4
+    exact = np.log(2.0) - np.log1p(np.exp([-side * d, side * d]))
+    for x in np.linspace(-0.4, 0.4, 9)[[0, 1, 2, 3, 5, 6, 7, 8]]:
+        theta = np.log1p([x, -x])
+        model.learn(theta, np.concatenate(law.residual(theta)))
+    model.fit()
+    offset = np.concatenate(law.residual(exact)) - model.predicted(exact)
+    end = model.cost(offset).end(np.zeros(2), 0.0, 0, side * d / 2.0, 2.0)
+    np.testing.assert_allclose(end, exact, atol=0.02)
+
+
+def test_chi_squared_of_a_model_has_the_gradient_of_its_differences() -> None:
+    rng = np.random.default_rng(2)
+    slopes = rng.standard_normal((12, 3))
+    point = EvaluatedPoint(0.1 * rng.standard_normal(3), (rng.standard_normal(5), rng.standard_normal(7)), (slopes[:5], slopes[5:]))
+    model = ResidualModel(point, np.linalg.qr(rng.standard_normal((3, 2)))[0], np.zeros(3), 1.2)
+    for theta in 0.3 * rng.standard_normal((8, 3)):
+        model.learn(theta, rng.standard_normal(12))
+    model.fit()
+    cost, at = model.cost(rng.standard_normal(12)), np.array([0.2, -0.1, 0.3])
+    differences = [(cost(at + h)[0] - cost(at - h)[0]) / 4e-5 for h in 1e-5 * np.eye(3)]
+    np.testing.assert_allclose(cost(at)[1], differences, rtol=1e-6)
+
+
+def test_linear_models_keep_the_covariance_of_least_squares() -> None:
+    rng = np.random.default_rng(1)
+    law = Linear(rng.standard_normal((40, 5)) * [20.0, 10.0, 5.0, 3.0, 2.0])
+    zero = np.zeros(5)
+    point = EvaluatedPoint(zero, (np.zeros(5), np.zeros(35)), (law.slopes[:5], law.slopes[5:]))
+    found, _ = widened_covariance(law, point, zero, WEAK_PRIOR, law)  # type: ignore[arg-type]
+    expected = np.linalg.inv(law.slopes.T @ law.slopes + np.eye(5) / WEAK_PRIOR**2)
+    np.testing.assert_allclose(np.sqrt(np.diag(found) / np.diag(expected)), 1.0, atol=0.02)
