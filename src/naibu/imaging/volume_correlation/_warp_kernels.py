@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,10 @@ from numba import prange
 
 from naibu._numba.compilation import njit
 from naibu.core.arrays import AnyArray, IntArray
+
+# Threads that wait sleep, as in the kernels of finite elements: between two kernels there is single-threaded work here, during which the
+# others would spin, at the cost of a third of the processor time where another program needs the core. Read when Numba starts its threads.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 F = np.float32
 # intensity of a voxel that has moved out of the volume; NaN does not survive fastmath

@@ -21,6 +21,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
+from threadpoolctl import threadpool_limits
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from naibu.core.errors import InputError
@@ -158,12 +159,13 @@ def correlate_volumes(
     Outer planes of NaN or of one intensity are padding: they are excluded from the comparison, and the displacement of what they hide is
     not answered (see `naibu.imaging.preprocessing.field_of_view`).
     """
-    correlation = Correlation(reference, deformed, (mask, deformed_mask), settings, progress)
-    correlation.initialize()
-    correlation.refine()
-    correlation.find_inclusions(rigid_mask)
-    correlation.adapt()
-    return correlation.result()
+    with threadpool_limits(1, user_api="blas"):  # threads of small matrices wait for one another where cores are busy
+        correlation = Correlation(reference, deformed, (mask, deformed_mask), settings, progress)
+        correlation.initialize()
+        correlation.refine()
+        correlation.find_inclusions(rigid_mask)
+        correlation.adapt()
+        return correlation.result()
 
 
 class Correlation:
@@ -410,10 +412,9 @@ class Correlation:
         fit, system = self.fit, self.fit.system
         fit.reliability = None
         fit.compare(self.c)
-
         system.sum_intensities(fit.products)
         tried, dilatation = loaded_trial_parts(system, system.matrix), self.dilatation * system.gauss_volume
-        system.assembled(self.c, fit.products, fit.force, self.bending, dilatation)
+        system.assembled(self.c, fit.products, fit.force, self.bending, dilatation, system.matrix, voxels=False)  # of the intensities
         require_overlap(float(fit.seen.mean()))
         refuse_unrelated(fit)
         content = common_content(fit, self.depth_mm(fit.level))
@@ -425,8 +426,7 @@ class Correlation:
         hidden = self.hidden(tried, fit.noise_samples(LATE_DRAWS, noise, self.settings.seed + 3), noise.scale)
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
         blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2, content.unlike)
-        weights = self.bending, self.dilatation
-        found = collected(self.volume, fit, self.c, samples, *weights, content, fit.cell_misfit(), hidden)
+        found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content, fit.cell_misfit(), hidden)
         return replace(found, blocks=blocks)
 
 

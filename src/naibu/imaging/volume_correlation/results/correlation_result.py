@@ -26,7 +26,7 @@ from naibu.imaging.volume_correlation.results.cell_errors import (
     strain_variance,
 )
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import InclusionMotion
-from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable, separable_slice
+from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable_slice
 
 LEAST_KNOWN = 1e-4  # weight of the known cells about a voxel, from which it is interpolated among all voxels at once
 
@@ -323,7 +323,10 @@ def collected(
     inside[level.mask] = answered & level.shows(level.index * level.spacing + fit.displacement)
     valid[box] = inside
     axes = [np.arange(n) * s for n, s in zip(volume.shape[::-1], volume.spacing_mm, strict=True)]
-    vectors = separable([system.grid.matrix(a, axes[a]) for a in range(3)], c)
+    along = [system.grid.matrix(a, axes[a]) for a in range(3)]
+    vectors = np.full((*volume.shape, 3), np.nan)
+    for k in np.flatnonzero(valid.any(axis=(1, 2))):
+        vectors[k] = separable_slice(along[0], along[1], along[2][k], c)
     inclusions = np.zeros(volume.shape, np.int32)
     motions = tuple(inclusion.motion for inclusion in fit.inclusions)
     for inclusion, motion in zip(fit.inclusions, motions, strict=True):
