@@ -41,7 +41,7 @@ def test_instants_of_one_table_in_other_units_and_a_ply_file_beside(tmp_path: Pa
         ("a.csv", "t,x,x_mm,y,z\n0,1,2,3,4\n", "", "are both x"),
         ("a.csv", "t,x,y,z\n-1,1,2,3\n", "", "-1 s"),
         ("a.csv", "t,x,y,z\n0,1e9,2,3\n", "", "point 1"),
-        ("a.csv", "", "", "0 rows"),
+        ("a.csv", "", "", "0 lines"),
         ("a.ply", PLY, "", "states no time"),
         ("a.ply", PLY, "soon=", "'soon'"),
         ("a.ply", PLY[:-6], "1=", "truncated"),

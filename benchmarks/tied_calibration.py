@@ -1,0 +1,50 @@
+"""Whether 95 % intervals of `naibu calibrate` hold, with tied boxes: draws of the virtual dough of ``naibu calibrate --example``.
+
+Run: python benchmarks/tied_calibration.py [--draws 9] [--first 0]
+
+Every draw is a seed of the example: five captures of 2800 points and two force sensors, nine parameters. Printed are simulations and
+processor time of every draw, which truths its intervals miss and by how many standard deviations, and how many are held in all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.workflows.studies.calibrate import calibrate_study
+from naibu.workflows.studies.calibration_example import SOURCE, write_calibration_example
+from naibu.workflows.studies.lattice_study import prepared_study
+
+
+def main() -> None:
+    """Calibrate the draws, and print what their intervals hold."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--draws", type=int, default=9)
+    parser.add_argument("--first", type=int, default=0)
+    options = parser.parse_args()
+    truth = StudyUnknowns.of(prepared_study(SOURCE).study).start
+    held, widths = [], []
+    for seed in range(options.first, options.first + options.draws):
+        began = time.process_time()
+        with TemporaryDirectory() as folder:
+            study, shapes, forces = write_calibration_example(Path(folder) / "dough", seed=seed)
+            found = calibrate_study(study, shapes=[shapes], forces=[forces], out=Path(folder) / "found").estimate
+        low, high = found.intervals().T
+        within = (low <= truth) & (truth <= high)
+        off = np.log(found.values / truth) / np.sqrt(np.diag(found.covariance))
+        missed = ", ".join(f"{name} ({z:+.1f} SD)" for name, z, one in zip(found.unknowns.names, off, within, strict=True) if not one)
+        print(f"seed {seed}: {time.process_time() - began:.0f} s, {found.runs} simulations; not held: {missed or 'none'}", flush=True)
+        held.append(within)
+        widths.append(0.5 * np.log(high / low))
+    print(f"held: {np.sum(held)} of {np.size(held)}")
+    for name, *width in zip(found.unknowns.names, np.min(widths, axis=0), np.max(widths, axis=0), strict=True):
+        print(f"half width of the logarithm of {name}: {width[0]:.2f} to {width[1]:.2f}")
+
+
+if __name__ == "__main__":
+    main()
