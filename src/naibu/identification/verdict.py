@@ -13,6 +13,7 @@ from naibu.core.arrays import FloatArray
 from naibu.identification.neighbours import neighbours
 
 NEIGHBOURS = 6
+UNDETERMINED = 4.0  # factor within which a parameter lies at 95 %, from which it is called not determined
 
 
 class Explanation(Enum):

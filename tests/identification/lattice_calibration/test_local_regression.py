@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from naibu.identification.lattice_calibration.intervals.local_regression import LocalRegression, Pair, regression
 from naibu.identification.lattice_calibration.least_squares import unsettled_covariance
-from naibu.identification.lattice_calibration.local_regression import LocalRegression, Pair, regression
 from naibu.identification.lattice_calibration.simulated_points import SimulatedPoints
 
 COUNT, PRIOR_SD = 2000, 3.0

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
-from naibu.identification.lattice_calibration.residual_model import RISE, ResidualModel
-from naibu.identification.lattice_calibration.widened_covariance import widened_covariance
+from naibu.identification.lattice_calibration.intervals.residual_model import RISE, ResidualModel
+from naibu.identification.lattice_calibration.intervals.widened_covariance import widened_covariance
 
 WEAK_PRIOR = 100.0
 

@@ -16,11 +16,11 @@ from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Z
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point, logarithms, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Objective
 from naibu.identification.from_fields.inversion.truncated_newton import RegularizedSystem, conjugate_gradients
+from naibu.identification.verdict import UNDETERMINED
 
 UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the information below which a combination is not determined at all
 PROBES = 24
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
-UNDETERMINED = 4.0  # factor within which a modulus lies at 95 %, from which it is called not determined
 POISSON_POORLY = 0.1
 NOT_DETERMINED = "not determined"
 MESH_DEPENDENT = "not determined (depends on the mesh)"

@@ -15,9 +15,9 @@ import numpy as np
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.mesh_error import relative_change
-from naibu.identification.from_fields.uncertainty import UNDETERMINED, Uncertainty
+from naibu.identification.from_fields.uncertainty import Uncertainty
 from naibu.identification.from_fields.verdict import SHARED
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import UNDETERMINED, Explanation, Verdict
 
 WITHIN = 0.5  # change of a logarithm from which a linear correction is worth nothing
 DETERMINED = 0.5  # standard deviation of a logarithm from measurement alone: 95 % intervals up to 7 times as high as low are determined

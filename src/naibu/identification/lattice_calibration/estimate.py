@@ -9,8 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.identification.lattice_calibration.inverse_problem import Unknowns
-
-UNDETERMINED = 4.0  # factor within which a parameter lies at 95 %, from which it is called not determined
+from naibu.identification.verdict import UNDETERMINED
 
 
 @dataclass(frozen=True, slots=True, eq=False)

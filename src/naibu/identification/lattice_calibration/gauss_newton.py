@@ -21,6 +21,8 @@ from naibu.core.progress import Progress
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual, evaluated
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
+from naibu.identification.lattice_calibration.intervals.local_regression import LocalRegression
+from naibu.identification.lattice_calibration.intervals.widened_covariance import widened_covariance
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 from naibu.identification.lattice_calibration.least_squares import (
     LONGEST,
@@ -32,12 +34,10 @@ from naibu.identification.lattice_calibration.least_squares import (
     step_within,
     unsettled_covariance,
 )
-from naibu.identification.lattice_calibration.local_regression import LocalRegression
 from naibu.identification.lattice_calibration.secant_search import SecantSearch
 from naibu.identification.lattice_calibration.shape_distance import closest_points
 from naibu.identification.lattice_calibration.simulated_points import SimulatedPoints
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns, identifiability
-from naibu.identification.lattice_calibration.widened_covariance import widened_covariance
 from naibu.mechanics.lattices.model.lattice import Lattice
 
 Index = Literal["shape", "force", "joint"]

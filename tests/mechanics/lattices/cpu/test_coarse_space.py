@@ -183,8 +183,8 @@ def test_what_contact_adds_to_the_coarse_matrix_is_the_product_of_its_own_with_c
     np.testing.assert_allclose(diagonal, np.einsum("akak->ak", expected), atol=1e-12 * np.abs(expected).max())
 
 
-@pytest.mark.parametrize(("name", "between"), [("classic", False), ("classic", True), ("octree", False)])
-def test_a_body_on_a_floor_that_a_plate_drags_needs_fewer_iterations(name, between, monkeypatch):
+@pytest.mark.parametrize(("name", "between", "share"), [("classic", False, 0.52), ("classic", True, 0.5), ("octree", False, 0.5)])
+def test_a_body_on_a_floor_that_a_plate_drags_needs_fewer_iterations(name, between, share, monkeypatch):
     """Contact is all that holds the body: coarse functions that did not know of it would not help. Results are those without them."""
     lattice = SPECIMENS[name][0]
     parameters = lattice_parameters(lattice, 40.0, 18.0, 1000.0)
@@ -208,7 +208,7 @@ def test_a_body_on_a_floor_that_a_plate_drags_needs_fewer_iterations(name, betwe
     ours, found, iterations = moved()
     np.testing.assert_allclose(found, force, atol=2e-3 * np.abs(force).max())
     np.testing.assert_allclose(ours, position, atol=2e-4 * np.abs(position - lattice.points).max())
-    assert iterations < 0.55 * plain
+    assert iterations < share * plain
 
 
 @pytest.mark.parametrize("seed", range(30))

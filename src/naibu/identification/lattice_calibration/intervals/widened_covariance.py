@@ -8,9 +8,9 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
+from naibu.identification.lattice_calibration.intervals.residual_model import RISE, ResidualModel
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 from naibu.identification.lattice_calibration.least_squares import Evaluations, cost_at, cost_of
-from naibu.identification.lattice_calibration.residual_model import RISE, ResidualModel
 
 FARTHEST = 0.7  # change of a logarithm to where chi-squared is followed
 WEAK = 4  # combinations along which residuals curve
