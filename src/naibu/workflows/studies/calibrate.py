@@ -301,7 +301,7 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
         )
     unknowns = problem.unknowns
     if not (known := estimate.determined()).any():
-        found.append("The data determine no parameter: the values in the calibrated study are near those of the start, and were not measured.")
+        found.append("The data determine no parameter: those of the calibrated study come from its start, and were not measured.")
     elif left := [name for name, one in zip(unknowns.names, known, strict=True) if not one]:
         found.append(f"Not determined within a factor of 4: {', '.join(left)}. The calibrated study states one value of many that fit.")
     for name, value, (low, high) in zip(unknowns.names, estimate.values, unknowns.bounds, strict=True):
