@@ -5,11 +5,12 @@ from __future__ import annotations
 import pickle
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
 from naibu._numba.compilation import njit
-from naibu._numba.intrinsics import packed_tuples
+from naibu._numba.intrinsics import _packed_type, packed_tuples
 from naibu._numba.intrinsics.packed_tuples import packed
 
 
@@ -64,6 +65,15 @@ def test_one_type_for_all_tuples_of_the_same_kinds() -> None:
     assert again == one.kind and again.name == one.kind.name
     single = packed(np.zeros(3, np.float32))
     assert single.kind != packed(np.zeros(3)).kind and single.kind.name != packed(np.zeros(3)).kind.name
+
+
+def test_types_are_told_apart_as_numba_does() -> None:
+    fixed = np.zeros((2, 3))
+    fixed.setflags(write=False)
+    told = [fixed, np.zeros((2, 3)), np.zeros(2), np.zeros((2, 3), np.int32), 1.0, np.float32(1.0), 2, 2**63, True, (np.zeros(2), 1)]
+    for one in told:
+        assert packed(one).kind == packed(one).kind == numba.typeof(_packed_type.packed(one))
+    assert len({packed(one).kind for one in told}) == len(told)
 
 
 def test_arrays_with_gaps_are_refused() -> None:

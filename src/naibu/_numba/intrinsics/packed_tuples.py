@@ -11,6 +11,7 @@ from __future__ import annotations
 from typing import Any
 
 import numba
+import numpy as np
 
 from naibu._numba.versions import passes
 
@@ -20,6 +21,7 @@ except Exception:  # whatever a changed interface raises
     PACKED = False
 else:
     PACKED = not getattr(numba.config, "DISABLE_JIT", 0) and passes(_packed_type.trial)
+_CLASSES: dict[tuple[Any, ...], Any] = {}  # of packed tuples, by what their types depend on
 
 
 def packed(*items: Any) -> Any:
@@ -35,4 +37,26 @@ def packed(*items: Any) -> Any:
     ValueError
         An array that is not contiguous.
     """
-    return _packed_type.packed(*items) if PACKED else items
+    if not PACKED:
+        return items
+    kind = _of_kind(items)
+    if kind not in _CLASSES:
+        _CLASSES[kind] = type(_packed_type.packed(*items))
+    own = _CLASSES[kind]
+    memory = np.zeros(max(own.kind.starts[-1], 1), dtype=np.int64)
+    _packed_type._fill(memory, own.kind, items)
+    made = own("q", memory.tobytes())
+    made.kept, made.address = items, made.buffer_info()[0]
+    return made
+
+
+def _of_kind(items: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return what the type of a packed tuple depends on; Numba takes milliseconds to find and to compare types of a hundred arrays."""
+    found: list[Any] = []
+    for one in items:
+        if type(one) is np.ndarray:
+            flags = one.flags
+            found.append((one.dtype, one.ndim, flags.c_contiguous, flags.writeable, flags.aligned))
+        else:
+            found.append(_of_kind(one) if isinstance(one, tuple) else numba.typeof(one))  # type: ignore[no-untyped-call]
+    return tuple(found)
