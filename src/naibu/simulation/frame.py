@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.interactive_bodies import InteractiveBody
+from naibu.simulation.tool_places import placed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,8 +34,10 @@ class Frame:
         Mean force of the tool on the body during the frame, mN.
     pull : ndarray, shape (3,)
         Mean force of the grip on the body, mN.
-    penetration_mm : float
-        How deep the surface nodes lie in the tool at most.
+    surface : ndarray, shape (s,), int64
+        Nodes of the surface.
+    shape : RigidIndenter, optional
+        The tool in play, as it was made.
     gripped : int
         Node that is gripped, or -1.
     failed : str
@@ -57,10 +61,19 @@ class Frame:
     tool_rotation: FloatArray
     force: FloatArray
     pull: FloatArray
-    penetration_mm: float
+    surface: IntArray
+    shape: RigidIndenter | None = None
     gripped: int = -1
     failed: str = ""
     topology: int = 0
     unbalanced: float = 0.0
     under_way: bool = False
     held: bool = False
+
+    @property
+    def penetration_mm(self) -> float:
+        """How deep the nodes of the surface lie in the tool at most; found when it is asked for, as most frames of 1 ms are not shown."""
+        if self.shape is None:
+            return 0.0
+        gaps = placed(self.shape, self.tool_centre, self.tool_rotation).gap(self.positions[self.surface])
+        return max(0.0, -float(gaps.min()))

@@ -60,6 +60,10 @@ class InteractiveBody(Protocol):
     def fixtures(self) -> tuple[RigidIndenter, ...]:
         """Rigid bodies in contact that never move, such as a table."""
 
+    @property
+    def unmoved_by_failures(self) -> bool:
+        """Whether a step that fails leaves the state as it was: then none is kept in every frame to be restored."""
+
     def session(self) -> AnySession:
         """Begin at rest on the supports, with the fixtures in contact."""
 
@@ -129,6 +133,11 @@ class LatticeBody:
     def step_s(self) -> float:
         """Length of a step, s."""
         return self.engine.step
+
+    @property
+    def unmoved_by_failures(self) -> bool:
+        """Whether a step that fails leaves the state as it was: implicit ones do not diverge."""
+        return self.engine.method == "implicit"
 
     def session(self) -> AnySession:
         """Begin at rest on the supports."""
@@ -313,6 +322,11 @@ class FiniteElementBody:
     def step_s(self) -> float:
         """Length of a step, s."""
         return self.engine.step
+
+    @property
+    def unmoved_by_failures(self) -> bool:
+        """Return False: a step at finite strain that finds no balance has moved the body."""
+        return False
 
     def session(self) -> AnySession:
         """Begin at rest on the supports."""

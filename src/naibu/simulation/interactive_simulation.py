@@ -83,6 +83,8 @@ class InteractiveSimulation:
     _last: Frame = field(init=False)
     _topology: int = field(init=False, default=0)
     _surface: IntArray = field(init=False)
+    _low: FloatArray = field(init=False)  # corners of the box around the body at rest, mm
+    _high: FloatArray = field(init=False)
     _held: HeldTool = field(init=False)
     _cutting: BackgroundCut | None = field(init=False, default=None)
     _next: str | None = field(init=False, default=None)  # tool that is taken when the one in play has left the body
@@ -111,7 +113,7 @@ class InteractiveSimulation:
     @property
     def extent_mm(self) -> float:
         """Largest edge of the box around the body at rest, mm."""
-        return float(np.ptp(self.body.points, axis=0).max())
+        return float((self._high - self._low).max())
 
     @property
     def fastest_mm_s(self) -> float:
@@ -321,7 +323,7 @@ class InteractiveSimulation:
         A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was when the step began.
         """
         self._leave()
-        before = self._session.state()
+        before = None if self.body.unmoved_by_failures else self._session.state()
         duration = self.steps * self.body.step_s
         centre, spin, gripped = self._under_way or self._next_motion(duration)
         motions = self._motions((centre - self._centre) / duration, spin)
@@ -329,7 +331,7 @@ class InteractiveSimulation:
         try:
             forces = self.body.step(self._session, self.body.grip_velocity(gripped / duration), motions, self.steps, self.budget_s)
         except ConvergenceError as error:
-            self._failures, said = self._failures + 1, str(error)
+            before, self._failures, said = before or self._session.state(), self._failures + 1, str(error)
             if self._failures > 1:  # where it moves on to is what has no balance
                 before, said = self.body.at_rest(before), f"{said}; the body was stopped where it was"
             self._session.restore(before)
@@ -379,10 +381,10 @@ class InteractiveSimulation:
         reach, gripped, centre, spin = self.fastest_mm_s * duration, self._grip_position(), self._target, np.zeros(3)
         if self._tool:
             tool, spin = self.tools[self._tool], self._spin(duration) * (not self._held.crushed)
-            turned = placed(tool, centre, rotation_matrix(duration * spin) @ self._rotation)
-            centre = towards(
-                self._centre, outside_planes(self.body.fixtures, turned, centre), min(reach, farthest_in_a_step(tool) * self.steps)
-            )
+            if self.body.fixtures:
+                turned = placed(tool, centre, rotation_matrix(duration * spin) @ self._rotation)
+                centre = outside_planes(self.body.fixtures, turned, centre)
+            centre = towards(self._centre, centre, min(reach, farthest_in_a_step(tool) * self.steps))
             centre = self._centre + self._held.limited(self._centre, centre - self._centre, self._last.force)
         return centre, spin, towards(gripped, self._pull_target, reach) - gripped
 
@@ -397,6 +399,7 @@ class InteractiveSimulation:
         if self._topology or self._kept:
             self._session.close()
         self.body, self._surface = body, np.unique(body.faces)
+        self._low, self._high = body.points.min(axis=0), body.points.max(axis=0)
         self._nodes, self._gripped = NO_NODES, -1
         self._held = HeldTool.by(body, self.frame_s, FRAME_S)
         self._session = body.session()
@@ -410,9 +413,10 @@ class InteractiveSimulation:
 
     def _spin(self, duration: float) -> FloatArray:
         """Return the angular velocity (3,), rad/s, of the tool in a frame."""
+        if np.linalg.norm(self._rotation_target - self._rotation) <= 2.0**0.5 * LEAST_TURN:  # the norm is 8^(1/2) sin(angle / 2)
+            return np.zeros(3)
         left = Rotation.from_matrix(self._rotation_target @ self._rotation.T).as_rotvec()
-        angle = float(np.linalg.norm(left))
-        return np.asarray(left / max(duration, angle / TURNING)) if angle > LEAST_TURN else np.zeros(3)
+        return np.asarray(left / max(duration, float(np.linalg.norm(left)) / TURNING))
 
     def _press(self, tool: str) -> None:
         """Bring the fixtures and a tool, where it waits, into play."""
@@ -431,8 +435,7 @@ class InteractiveSimulation:
         return self._pull_target if self._gripped < 0 else self._session.positions([self._gripped])[0]
 
     def _within(self, position: FloatArray) -> FloatArray:
-        middle = 0.5 * (self.body.points.min(axis=0) + self.body.points.max(axis=0))
-        reach = REACH * self.extent_mm
+        middle, reach = 0.5 * (self._low + self._high), REACH * self.extent_mm
         return np.asarray(np.clip(position, middle - reach, middle + reach))
 
     def _keep(self) -> None:
@@ -440,10 +443,7 @@ class InteractiveSimulation:
 
     def _frame(self, number: int, time_s: float, force: FloatArray, pull: FloatArray, failed: str) -> Frame:
         positions = self._session.positions()
-        depth = 0.0
-        if self._tool:
-            depth = max(0.0, -float(placed(self.tools[self._tool], self._centre, self._rotation).gap(positions[self._surface]).min()))
         return Frame(
-            self.body, number, time_s, positions, self._tool, self._centre, self._rotation, force, pull, depth, self._gripped, failed,
-            self._topology, self.body.unbalanced(self._session), held=self._held.held,
+            self.body, number, time_s, positions, self._tool, self._centre, self._rotation, force, pull, self._surface,
+            self.tools.get(self._tool), self._gripped, failed, self._topology, self.body.unbalanced(self._session), held=self._held.held,
         )  # fmt: skip
