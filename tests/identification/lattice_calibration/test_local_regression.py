@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from naibu.identification.lattice_calibration.intervals.local_regression import LocalRegression, Pair, regression
 from naibu.identification.lattice_calibration.least_squares import unsettled_covariance
@@ -35,11 +36,11 @@ class Jumping:
         found = [self._law(theta, fine=fine) - self.measured for theta, fine in trials]
         return [(r[: COUNT // 2], r[COUNT // 2 :]) for r in found]
 
-    def estimated(self) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Return errors and standard deviations, and whether the regressions settled."""
+    def estimated(self, begin: np.ndarray | None = None, prior_sd: float = PRIOR_SD) -> tuple[np.ndarray, np.ndarray, bool]:
+        """Return errors and standard deviations, and whether the regressions settled; they begin in the centre of the prior, zero."""
         p, points = len(self.truth), SimulatedPoints(self, self)  # type: ignore[arg-type]
-        begin = np.zeros(p)
-        local = LocalRegression(points, begin, points.simulated([(begin, False)])[0], begin, PRIOR_SD, 0.03**2 * np.eye(p))
+        begin = np.zeros(p) if begin is None else begin
+        local = LocalRegression(points, begin, points.simulated([(begin, False)])[0], np.zeros(p), prior_sd, 0.03**2 * np.eye(p))
         point, covariance = local.run()
         return point.theta - self.truth, np.sqrt(np.diag(covariance)), local.settled
 
@@ -75,6 +76,16 @@ def test_an_offset_of_long_steps_is_corrected() -> None:
 def test_what_jumps_alone_move_is_not_determined() -> None:
     _, sd, _ = Jumping(4, [0.0, 1.0], 0.5).estimated()
     assert sd[0] > 0.5
+
+
+@pytest.mark.parametrize("away", [-2.6, 2.6])
+def test_what_is_not_determined_holds_what_the_prior_holds_wherever_the_search_ended(away: float) -> None:
+    """A search may go a factor of 13 away along a parameter that the data say nothing of: 95 % of the prior are within the interval."""
+    error, sd, settled = Jumping(4, [0.0, 1.0], 0.03).estimated(np.array([away, 0.0]), prior_sd=1.2)
+    assert settled
+    assert np.sign(away) * error[0] > 1.5
+    assert 1.96 * sd[0] > np.abs(error[0]) + 1.64 * 1.2
+    assert sd[1] < 0.5
 
 
 def test_where_a_search_did_not_come_to_rest_intervals_hold_what_the_prior_holds() -> None:

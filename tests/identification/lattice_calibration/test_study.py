@@ -12,7 +12,7 @@ from lattice_studies import study_file
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
 from naibu.identification.lattice_calibration.evaluation import evaluated
-from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
+from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD, calibrate_lattice, estimate_at
 from naibu.identification.lattice_calibration.study_model import StudyModel
 from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
@@ -98,6 +98,8 @@ kinetic_friction = 0.4
 path = [[0.0, 0, 0, 0], [1.0, 0, 0, -3.6], [1.2, 3.6, 0, -3.6]]
 """
 
+FLOOR, MU = "kinetic friction of floor", 0.3
+
 
 @pytest.fixture
 def squeezed(tmp_path: Path) -> LatticeStudy:
@@ -155,20 +157,22 @@ def test_shares_of_samples_weigh_the_steps_alike(squeezed: LatticeStudy) -> None
     assert np.abs(residual).max() < 1e-3 * np.abs(fine).max()
 
 
-def test_friction_of_a_pushed_block_is_force_over_weight(pushed: LatticeStudy) -> None:
-    """A block that slides steadily is pushed by mu_k m g; the record is made by that law alone, not by a simulation."""
-    unknowns = StudyUnknowns.of(pushed, groups="given", friction="each")
-    times = np.arange(0.2, 0.4, 0.001)
-    truth, weight = 0.3, 200e-3 * 9810.0
-    force = np.column_stack([np.full(len(times), truth * weight), np.zeros((len(times), 2))])
+def steadily_pushed(study: LatticeStudy) -> StudyProblem:
+    """Return the search for friction of a block that slides steadily: pushed by mu_k m g, by that law alone, not by a simulation."""
+    times, weight = np.arange(0.2, 0.4, 0.001), 200e-3 * 9810.0
+    force = np.column_stack([np.full(len(times), MU * weight), np.zeros((len(times), 2))])
     noisy = force + 5.0 * np.random.default_rng(0).standard_normal(force.shape)
-    recorded = RecordedForces.of(pushed, [(1, times, noisy)], sd_mn=5.0)
-    problem = StudyProblem.of(unknowns, [], recorded, point_sd_mm=0.5)
-    found = calibrate_lattice(problem, unknowns.start)
-    place = unknowns.names.index("kinetic friction of floor")
-    assert found.values[place] == pytest.approx(truth, rel=0.01)
+    recorded = RecordedForces.of(study, [(1, times, noisy)], sd_mn=5.0)
+    return StudyProblem.of(StudyUnknowns.of(study, groups="given", friction="each"), [], recorded, point_sd_mm=0.5)
+
+
+def test_friction_of_a_pushed_block_is_force_over_weight(pushed: LatticeStudy) -> None:
+    problem = steadily_pushed(pushed)
+    found = calibrate_lattice(problem, problem.unknowns.start)
+    place = problem.unknowns.names.index(FLOOR)
+    assert found.values[place] == pytest.approx(MU, rel=0.01)
     low, high = found.intervals()[place]
-    assert low < truth < high and high - low < 0.05
+    assert low < MU < high and high - low < 0.05
     assert any("static friction of floor" in sentence for sentence in found.undetermined)
 
 
@@ -190,21 +194,51 @@ def test_truth_of_a_squeezed_block_lies_within_its_intervals(squeezed: LatticeSt
     assert reports[-1].done == len(reports) and found.finished
 
 
-def test_an_interruption_keeps_the_best_so_far(squeezed: LatticeStudy) -> None:
+@pytest.mark.parametrize("after", [1, 2, 3, 4, 6])
+def test_an_interruption_keeps_the_best_so_far(squeezed: LatticeStudy, after: int) -> None:
+    """With intervals that reach the truth, however far it still was from there."""
     unknowns = StudyUnknowns.of(squeezed, groups="all")
-    force = StudyModel.of(squeezed, [], 200, 1, coarse=False).run(unknowns.parameters(2.0 * unknowns.start)).force[:, 1]
+    truth = 2.0 * unknowns.start
+    force = StudyModel.of(squeezed, [], 200, 1, coarse=False).run(unknowns.parameters(truth)).force[:, 1]
     recorded = RecordedForces.of(squeezed, [(1, squeezed.step_s * (np.arange(200) + 0.5), force)], sd_mn=10.0)
     problem = StudyProblem.of(unknowns, [], recorded, point_sd_mm=0.5)
 
     def stop(report: ProgressReport) -> None:
-        if report.done == 4:
+        if report.done == after:
             raise KeyboardInterrupt
 
     found = calibrate_lattice(problem, unknowns.start, progress=stop)
     points = [evaluated(problem, np.log(values), derivatives=False) for values in (unknowns.start, found.values)]
     costs = [sum((r**2).sum() for r in point.residual) for point in points]
-    assert not found.finished
-    assert costs[1] < costs[0]
+    assert not found.finished and "few percent off" in found.remarks[0]
+    assert costs[1] <= costs[0]
+    assert after < 4 or costs[1] < costs[0]
+    assert (np.abs(np.log(found.values / truth)) < 1.96 * np.sqrt(np.diag(found.covariance))).all()
+
+
+def test_an_interruption_in_contact_leaves_what_the_prior_holds(pushed: LatticeStudy) -> None:
+    """Differences of simulations count jumps as information, and nothing has told them apart yet."""
+    problem = steadily_pushed(pushed)
+
+    def stop(report: ProgressReport) -> None:
+        if report.done == 7:
+            raise KeyboardInterrupt
+
+    found = calibrate_lattice(problem, problem.unknowns.start, progress=stop)
+    assert not found.finished and not found.settled and "interrupted" in found.remarks[0]
+    assert (np.sqrt(np.diag(found.covariance)) >= PRIOR_SD).all()
+    assert not found.determined().any()
+
+
+def test_values_of_another_search_get_intervals_of_regressions_in_contact(pushed: LatticeStudy) -> None:
+    problem = steadily_pushed(pushed)
+    searched = calibrate_lattice(problem, problem.unknowns.start)
+    found = estimate_at(problem, 1.02 * searched.values)
+    place = problem.unknowns.names.index(FLOOR)
+    low, high = found.intervals()[place]
+    assert found.settled
+    assert low < MU < high and high - low < 0.05
+    assert not found.determined()[problem.unknowns.names.index("static friction of floor")]
 
 
 def test_masses_of_the_surface_keep_the_total() -> None:

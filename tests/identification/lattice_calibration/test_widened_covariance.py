@@ -9,7 +9,7 @@ import pytest
 
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
 from naibu.identification.lattice_calibration.intervals.residual_model import RISE, ResidualModel
-from naibu.identification.lattice_calibration.intervals.widened_covariance import widened_covariance
+from naibu.identification.lattice_calibration.intervals.widened_covariance import FARTHEST, widened_covariance
 
 WEAK_PRIOR = 100.0
 
@@ -51,12 +51,40 @@ class Linear:
 def test_intervals_reach_to_the_end_of_the_profile_along_a_curved_valley(sd: float, offset: float) -> None:
     """On K1 + K2 = 2 the logarithm d of the ratio rises to 1.96 sd: K1 = 2 / (1 + exp(d)) there; derivatives say exp(-d / 2)."""
     law = Sum(sd, offset)
-    found, runs = widened_covariance(law, law.point(), np.zeros(2), WEAK_PRIOR, law)  # type: ignore[arg-type]
+    widened = widened_covariance(law, law.point(), np.zeros(2), WEAK_PRIOR, law)  # type: ignore[arg-type]
     d = np.sqrt(RISE) * sd
     expected = np.log((1.0 + np.exp(d)) / 2.0)
-    np.testing.assert_allclose(1.96 * np.sqrt(np.diag(found)), expected, rtol=0.02)
+    np.testing.assert_allclose(1.96 * np.sqrt(np.diag(widened.covariance)), expected, rtol=0.02)
     assert expected > (1.02 if sd < 0.2 else 1.1) * d / 2.0  # what derivatives say is too little
-    assert runs == law.runs < 40
+    assert law.runs < 40
+    assert bool(widened.unconfirmed) == (expected > FARTHEST)  # up to there chi-squared is followed
+
+
+def test_ends_that_no_simulation_confirms_are_told_and_not_drawn_in() -> None:
+    """The profile rises to its quantile far beyond where it is followed."""
+    law = Sum(5.0)
+    widened = widened_covariance(law, law.point(), np.zeros(2), WEAK_PRIOR, law)  # type: ignore[arg-type]
+    derivatives = np.sqrt(RISE) * 5.0 / 2.0
+    assert (1.96 * np.sqrt(np.diag(widened.covariance)) > 0.99 * derivatives).all()
+    assert widened.unconfirmed == (0, 1)
+    assert "ends of the intervals of K1, K2" in widened.remarks(("K1", "K2"))[0]
+
+
+class Valley(Linear):
+    """Residuals of a valley in which chi-squared is lower by 100 beyond a step of the logarithm of 0.3."""
+
+    def many(self, at: Any, trials: list[tuple[np.ndarray, bool]]) -> list[Residual]:
+        found = super().many(at, trials)
+        return [(np.append(a, 10.0 * (theta[0] < 0.3)), b) for (a, b), (theta, _) in zip(found, trials, strict=True)]
+
+
+def test_a_better_fit_beyond_the_end_of_an_interval_is_told() -> None:
+    law = Valley(np.diag([5.0] * 5 + [0.0])[:, :5])
+    zero, slopes = np.zeros(5), np.vstack([law.slopes[:5], np.zeros(5)])
+    point = EvaluatedPoint(zero, (np.append(np.zeros(5), 10.0), np.zeros(1)), (slopes, law.slopes[5:]))
+    widened = widened_covariance(law, point, zero, WEAK_PRIOR, law)  # type: ignore[arg-type]
+    assert widened.lower > 80.0
+    assert any("there is a better fit" in remark for remark in widened.remarks(tuple("abcde")))
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
@@ -92,6 +120,6 @@ def test_linear_models_keep_the_covariance_of_least_squares() -> None:
     law = Linear(rng.standard_normal((40, 5)) * [20.0, 10.0, 5.0, 3.0, 2.0])
     zero = np.zeros(5)
     point = EvaluatedPoint(zero, (np.zeros(5), np.zeros(35)), (law.slopes[:5], law.slopes[5:]))
-    found, _ = widened_covariance(law, point, zero, WEAK_PRIOR, law)  # type: ignore[arg-type]
+    found = widened_covariance(law, point, zero, WEAK_PRIOR, law).covariance  # type: ignore[arg-type]
     expected = np.linalg.inv(law.slopes.T @ law.slopes + np.eye(5) / WEAK_PRIOR**2)
     np.testing.assert_allclose(np.sqrt(np.diag(found) / np.diag(expected)), 1.0, atol=0.02)

@@ -37,6 +37,8 @@ class LatticeEstimate:
         Whether the search came to its end; otherwise Ctrl-C left the best so far.
     settled : bool
         Whether it came to rest there; otherwise the covariance holds what the weak prior holds.
+    remarks : tuple of str
+        In words, what the intervals rest on where they are not those that are described here.
     """
 
     unknowns: Unknowns
@@ -49,6 +51,7 @@ class LatticeEstimate:
     undetermined: tuple[str, ...]
     finished: bool = True
     settled: bool = True
+    remarks: tuple[str, ...] = ()
 
     def parameters(self) -> Any:
         """Return the parameters of all elements; of a study, a `naibu.identification.Trial`."""
@@ -64,10 +67,10 @@ class LatticeEstimate:
         return np.asarray(1.96 * np.sqrt(np.diag(self.covariance)) <= np.log(UNDETERMINED))
 
     def sentences(self) -> tuple[str, ...]:
-        """Return the result in sentences, and what the data do not determine."""
+        """Return the result in sentences, what the data do not determine, and what the intervals rest on."""
         lines = []
         rows = zip(self.unknowns.names, self.unknowns.units, self.values, self.intervals(), self.determined(), strict=True)
         for name, unit, value, (low, high), known in rows:
             said = f"{value:.4g} {unit}".rstrip() if known else "not determined"
             lines.append(f"{name}: {said} (95 % between {low:.4g} and {high:.4g})")
-        return (*lines, *self.undetermined)
+        return (*lines, *self.undetermined, *self.remarks)

@@ -30,6 +30,7 @@ from naibu.identification.lattice_calibration.least_squares import (
     Evaluations,
     cost_of,
     covariance_at,
+    covariance_before_the_minimum,
     noise_factors,
     step_within,
     unsettled_covariance,
@@ -49,6 +50,11 @@ TELLING = 0.05  # change of a logarithm from which on a step tells of derivative
 ENOUGH = 2e-3  # of the cost, while the noise is still taken as stated
 FARTHEST = 3.0  # change of a logarithm in one iteration, after steps that did what they promised
 POOR, WELL = 0.3, 0.75  # of the promised decrease, from which on steps become shorter, or may become longer
+IMPROVED = (
+    "Intervals rest on derivatives that steps of the search improved, a few percent off, and are not widened to where chi-squared itself "
+    "rises."
+)
+CUT_SHORT = "The search was interrupted before anything told how exact its values are: intervals hold what the weak prior holds."
 IDLE = 2  # steps one after the other that change next to nothing, before the search ends
 
 
@@ -219,13 +225,15 @@ def calibrate_lattice(
     widen : bool
         Whether the covariance is widened to where chi-squared itself rises, all others fitted again, which takes derivatives once
         more and, of nine parameters, some forty simulations of each load case; not of differences of simulations, as in contact.
+        Otherwise derivatives are those that steps of the search improved, and `LatticeEstimate.remarks` says so.
     threads : int
         Into how many parts the derivatives of every capture are shared; by default as many threads compute them.
     executor : concurrent.futures.Executor
         Computes the parts instead: a ``ProcessPoolExecutor``, or ``client.get_executor()`` of a `dask.distributed.Client`.
     progress : callable
         Called with a `ProgressReport` after every evaluation; the objective is chi-squared over the number of residuals. Where it raises
-        KeyboardInterrupt, or Ctrl-C does, the best estimate so far is returned, with the intervals that belong there.
+        KeyboardInterrupt, or Ctrl-C does, the best estimate so far is returned, with intervals that reach to where the search
+        was going; in contact, as far as the weak prior does.
 
     Raises
     ------
@@ -246,7 +254,7 @@ def calibrate_lattice(
     except KeyboardInterrupt:
         if at.best is None or at.problem is None:
             raise
-        return _estimate(at.problem, at.best, covariance_at(at.best, prior_sd), at.count, at.count * (1 + len(centre)), finished=False)
+        return _interrupted(at.problem, at.best, centre, prior_sd, at)
 
 
 def _searched(
@@ -268,10 +276,20 @@ def _searched(
     point, used = _corrected(here, point, prior, most, at)
     count += used
     if not widen:
-        return _estimate(here, point, covariance_at(point, prior_sd), count, at.runs)
+        return replace(_estimate(here, point, covariance_at(point, prior_sd), count, at.runs), remarks=(IMPROVED,))
     point = replace(point, slopes=at(here, point.theta).slopes)
-    covariance = widened_covariance(here, point, centre, prior_sd, at)[0]
-    return _estimate(here, point, covariance, count, at.runs)
+    widened = widened_covariance(here, point, centre, prior_sd, at)
+    return replace(_estimate(here, point, widened.covariance, count, at.runs), remarks=widened.remarks(problem.unknowns.names))
+
+
+def _interrupted(problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations) -> LatticeEstimate:
+    """Return the best so far; its derivatives may be those of steps, and in contact they count jumps as information."""
+    if problem.shifts(np.exp(point.theta)) is not None:
+        covariance = unsettled_covariance(point.theta, centre, prior_sd)
+        found = _estimate(problem, point, covariance, at.count, at.runs, finished=False)
+        return replace(found, information=np.zeros_like(covariance), settled=False, remarks=(CUT_SHORT,))
+    covariance = covariance_before_the_minimum(point, centre, prior_sd)
+    return replace(_estimate(problem, point, covariance, at.count, at.runs, finished=False), remarks=(IMPROVED,))
 
 
 def _in_other_units(point: EvaluatedPoint, old: tuple[float, float], new: tuple[float, float]) -> EvaluatedPoint:
@@ -308,8 +326,13 @@ def _estimate(
     )  # fmt: skip
 
 
-def estimate_at(problem: InverseProblem, values: ArrayLike, *, prior_sd: float = PRIOR_SD, finished: bool = True) -> LatticeEstimate:
+def estimate_at(
+    problem: InverseProblem, values: ArrayLike, *, prior_sd: float = PRIOR_SD, finished: bool = True, threads: int = 2
+) -> LatticeEstimate:
     """Return values that were found by another search as an estimate, with the intervals that derivatives give there.
+
+    Intervals reach to where derivatives say that the minimum is. In contact derivatives count jumps as information: there regressions
+    around these values, as those of `calibrate_lattice`, give the estimate and its intervals.
 
     Parameters
     ----------
@@ -321,6 +344,8 @@ def estimate_at(problem: InverseProblem, values: ArrayLike, *, prior_sd: float =
         Standard deviation of the logarithms.
     finished : bool
         Whether the search came to its end.
+    threads : int
+        That simulate.
 
     Raises
     ------
@@ -328,11 +353,13 @@ def estimate_at(problem: InverseProblem, values: ArrayLike, *, prior_sd: float =
         Values that are not positive.
     """
     theta = np.log(problem.unknowns.vector(values))
+    if problem.shifts(np.exp(theta)) is not None:
+        return replace(_searched_in_contact(problem, theta, theta, prior_sd, 0, Evaluations(threads, None, None)), finished=finished)
     factors = noise_factors(problem, evaluated(problem, theta, derivatives=False, fine=True).residual)
     here = problem.enlarged((max(factors[0], 1.0), max(factors[1], 1.0)))
     residual = evaluated(here, theta, derivatives=False, fine=True).residual
     point = replace(evaluated(here, theta), residual=residual)
-    return _estimate(here, point, covariance_at(point, prior_sd), 0, 3 + len(theta), finished=finished)
+    return _estimate(here, point, covariance_before_the_minimum(point, theta, prior_sd), 0, 3 + len(theta), finished=finished)
 
 
 def _corrected(

@@ -102,6 +102,26 @@ def covariance_at(point: EvaluatedPoint, prior_sd: float) -> FloatArray:
     return np.asarray(np.linalg.inv(point.information + np.eye(len(point.theta)) / prior_sd**2), dtype=np.float64)
 
 
+def covariance_before_the_minimum(point: EvaluatedPoint, centre: FloatArray, prior_sd: float) -> FloatArray:
+    """Return the covariance (p, p) about a point that need not be the minimum: second moments about it, of what the derivatives there say.
+
+    Residuals count as noise, and the step to the minimum that derivatives promise as a deviation, as far as the prior reaches.
+    """
+    excess = max(misfit(point.residual) / max(sum(map(len, point.residual)), 1), 1.0)
+    hessian = point.information / excess + np.eye(len(point.theta)) / prior_sd**2
+    covariance = np.asarray(np.linalg.inv(hessian), dtype=np.float64)
+    step = np.asarray(-covariance @ (point.gradient() / excess + (point.theta - centre) / prior_sd**2), dtype=np.float64)
+    return about(covariance, step, unsettled_covariance(point.theta, centre, prior_sd))
+
+
+def about(covariance: FloatArray, step: FloatArray, most: FloatArray) -> FloatArray:
+    """Return second moments (p, p) about a point from which a mean lies by a step (p,), with variances of at most those of another one."""
+    moments = covariance + np.outer(step, step)
+    factor = np.minimum(np.sqrt(np.diag(most) / np.diag(moments)), 1.0)
+    limited = moments * np.outer(factor, factor)
+    return np.asarray(0.5 * (limited + limited.T))
+
+
 def noise_factors(problem: InverseProblem, residual: Residual) -> tuple[float, float]:
     """Return root mean squares of the residuals of points and forces in units of the stated noise; 0 of what there is none of."""
     rms = [float(np.sqrt((r**2).mean())) if len(r) else 0.0 for r in residual]

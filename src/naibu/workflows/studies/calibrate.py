@@ -278,7 +278,8 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
             "trials with known truth one of 66 was still too narrow (benchmarks/lattice_calibration.py). Take them as the least "
             "uncertainty."
         )
-    if not estimate.settled:
+    found += estimate.remarks
+    if not estimate.settled and estimate.finished:
         found.append(
             "The search did not come to rest: long and short steps of time differ by more than the noise, or contacts jump between "
             "sticking and sliding. Intervals hold what the weak prior holds, as if "

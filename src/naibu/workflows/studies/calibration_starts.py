@@ -163,7 +163,7 @@ def searched(
         return calibrate_lattice(problem, problem.unknowns.start, warm_start=start, threads=threads, progress=progress)
     search = search_cma_es if method == "cma-es" else search_genetic
     found = search(problem, start, seed=seed, measure="chi-squared", max_runs=max_runs, progress=progress)
-    return estimate_at(problem, found.values, finished=found.finished)
+    return estimate_at(problem, found.values, finished=found.finished, threads=threads)
 
 
 def best_of(problem: StudyProblem, searches: tuple[StartedSearch, ...], *, complete: bool) -> CalibratedFromStarts:

@@ -22,7 +22,7 @@ from scipy.ndimage import uniform_filter1d
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint
-from naibu.identification.lattice_calibration.least_squares import unsettled_covariance
+from naibu.identification.lattice_calibration.least_squares import about, unsettled_covariance
 from naibu.identification.lattice_calibration.simulated_points import FARTHEST, SimulatedPoints
 
 NARROWEST = 0.004  # standard deviation of relative changes of the values around the estimate, along principal axes
@@ -50,7 +50,9 @@ class Regression:
     Attributes
     ----------
     steps : tuple of ndarray, shape (p,)
-        From its centre to the estimate, without and with what jumps may pretend.
+        From its centre to the estimate, without and with what jumps may pretend, as far as the regression may be followed.
+    way : ndarray, shape (p,)
+        All of the first step, in logarithms: where data say nothing, to the centre of the prior.
     covariance : ndarray, shape (p, p)
         Of the estimate, errors of the model included.
     slopes : ndarray, shape (n, p)
@@ -64,6 +66,7 @@ class Regression:
     """
 
     steps: tuple[FloatArray, FloatArray]
+    way: FloatArray
     covariance: FloatArray
     slopes: FloatArray
     weights: FloatArray
@@ -151,14 +154,8 @@ def regression(
     for rest, share in parts:
         moved = rest @ gain.T
         covariance = covariance + share * moved.T @ moved
-    return Regression(steps, _at_most(covariance, unsettled_covariance(theta, centre, prior_sd)), slopes, weights, jumps, free)
-
-
-def _at_most(covariance: FloatArray, most: FloatArray) -> FloatArray:
-    """Return a covariance (p, p) with variances of at most those of another one."""
-    factor = np.minimum(np.sqrt(np.diag(most) / np.diag(covariance)), 1.0)
-    limited = covariance * np.outer(factor, factor)
-    return np.asarray(0.5 * (limited + limited.T))
+    limited = about(covariance, np.zeros(p), unsettled_covariance(theta, centre, prior_sd))
+    return Regression(steps, -np.linalg.solve(hessian, slope), limited, slopes, weights, jumps, free)
 
 
 def _places(pairs: Sequence[Pair], theta: FloatArray, root: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -220,7 +217,8 @@ class LocalRegression:
 
     In every round the lattice is simulated on both sides along random orthogonal directions, as far away as is typical of the covariance,
     but no farther than the linear model holds. Both steps of the regression are simulated, the better one is taken. Once steps stay within
-    the covariance and chi-squared falls no longer, fine steps of time at a few points tell what to add to residuals of long ones.
+    the covariance and chi-squared falls no longer, fine steps of time at a few points tell what to add to residuals of long ones. What is
+    left of the way that the last regression points is a deviation: a search may have ended far away along what the data do not tell.
 
     Attributes
     ----------
@@ -255,7 +253,7 @@ class LocalRegression:
     _rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
 
     def run(self) -> tuple[EvaluatedPoint, FloatArray]:
-        """Return where it ended, with residuals as of fine steps, and the covariance (p, p)."""
+        """Return where it ended, with residuals as of fine steps, and second moments (p, p) about it."""
         p, corrected, due = len(self.theta), False, False
         while True:
             spread = _within(SPREAD**2 * self.covariance, self._widest)
@@ -265,12 +263,15 @@ class LocalRegression:
             sd = np.sqrt(np.diag(fit.covariance))
             near = bool((np.abs(fit.steps) <= CLOSE * sd).all()) and fit.free >= p // 2
             near = near and np.trace(np.linalg.solve(spread, _within(SPREAD**2 * fit.covariance, self._widest))) < WIDER**2 * p
+            end = self.theta + fit.way
             near = self._move(fit, spread) < WORTH * p and near
             self.covariance = fit.covariance
             if self.rounds >= ROUNDS or (near and corrected):
                 self.settled = near and corrected
                 residual = self.points.parts(self.long + self._offset)
-                return EvaluatedPoint(self.theta, residual, self.points.parts(fit.slopes)), fit.covariance
+                most = unsettled_covariance(self.theta, self.centre, self.prior_sd)
+                covariance = about(fit.covariance, end - self.theta, most)
+                return EvaluatedPoint(self.theta, residual, self.points.parts(fit.slopes)), covariance
             due = near
             self._adapt(fit.jumps)
 

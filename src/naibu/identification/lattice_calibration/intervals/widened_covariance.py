@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -42,16 +43,52 @@ class _End:
         return float(abs(self.at[self.k] - theta[self.k]) * (further if self.met else max(further, 1.0)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class WidenedCovariance:
+    """Covariance that reaches to the ends of profile likelihoods.
+
+    Attributes
+    ----------
+    covariance : ndarray, shape (p, p)
+        Of logarithms.
+    unconfirmed : tuple of int
+        Parameters of which no simulation confirmed that chi-squared has risen at an end by its 95 % quantile.
+    lower : float
+        By how much chi-squared was lower at an end than where the search ended, at most; 0 if nowhere.
+    """
+
+    covariance: FloatArray
+    unconfirmed: tuple[int, ...]
+    lower: float
+
+    def remarks(self, names: Sequence[str]) -> tuple[str, ...]:
+        """Return in words what was not confirmed, of parameters with these names."""
+        found = []
+        if self.unconfirmed:
+            found.append(
+                "No simulation confirmed the ends of the intervals of "
+                + ", ".join(names[k] for k in self.unconfirmed)
+                + ": they are extrapolated from how chi-squared rises nearer by."
+            )
+        if self.lower > RISE:
+            found.append(
+                f"Chi-squared is lower by {self.lower:.3g} at an end of an interval than where the search ended: there is a better fit. "
+                "Search from several starts."
+            )
+        return tuple(found)
+
+
 def widened_covariance(
     problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations
-) -> tuple[FloatArray, int]:
-    """Return the covariance at a point, widened to where chi-squared rises by its 95 % quantile, all others fitted again; and the runs.
+) -> WidenedCovariance:
+    """Return the covariance at a point, widened to where chi-squared rises by its 95 % quantile, all others fitted again.
 
     Values that compensate each other lie along a curved valley of chi-squared, which derivatives at its bottom do not tell. How residuals
     curve along the least determined combinations is told by simulations around the point (`ResidualModel`). The ends of all intervals,
     along the valley, are sought with that model and simulated; what residuals there differ by is added to those of the model, and the end
     is sought again, until the simulation confirms it (output space mapping; :cite:t:`bandler2004`). Standard deviations reach the farther
-    end. They are never less than derivatives say.
+    end. They are never less than derivatives say. Where no simulation confirms an end, it is not drawn in, but moved out by the square
+    root of what chi-squared lacks there, up to `WIDEST` times.
 
     Parameters
     ----------
@@ -66,7 +103,7 @@ def widened_covariance(
         Of residuals.
     """
     covariance = np.asarray(np.linalg.inv(point.information + np.eye(len(point.theta)) / prior_sd**2))
-    before, coarse = at.runs, at.many(problem, [(point.theta, False)])[0]
+    coarse = at.many(problem, [(point.theta, False)])[0]
     values, vectors = np.linalg.eigh(covariance)
     weak = vectors[:, ::-1][:, :WEAK]
     model = ResidualModel(point, weak, centre, prior_sd)
@@ -96,7 +133,8 @@ def widened_covariance(
     for end in ends:
         reached[end.k] = max(reached[end.k], end.distance(point.theta))
     factor = reached / (QUANTILE * np.sqrt(np.diag(covariance)))
-    return covariance * np.outer(factor, factor), at.runs - before
+    unconfirmed = tuple(sorted({end.k for end in ends if not end.met}))
+    return WidenedCovariance(covariance * np.outer(factor, factor), unconfirmed, max(0.0, -min(end.rise for end in ends)))
 
 
 def _around(theta: FloatArray, directions: FloatArray) -> list[FloatArray]:
