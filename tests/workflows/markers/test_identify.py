@@ -28,6 +28,7 @@ from naibu.core.errors import ConvergenceError, InputError, WorkerLostError
 from naibu.core.experiment import Experiment
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.prediction import cross_validation as folds
 from naibu.identification.verdict import Explanation
 from naibu.io.experiment_folder.state_csv import parse_state_csv
@@ -39,7 +40,7 @@ from naibu.workflows.markers import cross_validation, identify
 from naibu.workflows.markers.cross_validation import left_out_in_turn
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.report_content import load_case_scene, prediction_scene
-from naibu.workflows.results.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model
+from naibu.workflows.results.result_folder import CHECKPOINT_FILE, MODEL_FILE, _identification_summary, read_model
 from naibu.workflows.results.search_checkpoint import SearchCheckpoint
 
 STATE = {"press": ["pressed"]}
@@ -91,6 +92,18 @@ def test_results_are_complete(press: Press) -> None:
     assert trial["rms_3d_mm"] < trial["baselines_rms_3d_mm"]["affine"] < trial["baselines_rms_3d_mm"]["rigid"]
     plate, table = (trial["reactions_mN"][name] for name in ("indenter of acrylic", "base of table"))
     np.testing.assert_allclose(plate, np.negative(table), atol=1e-4 * abs(table[2]))
+
+
+def test_ratios_are_not_written_as_forces_and_kilopascals(press: Press) -> None:
+    found = press.identification
+    known = KnownMaterials(found.model.known_materials.young_moduli, scale_is_absolute=False)
+    summary = _identification_summary(found.calibration, replace(found.model, known_materials=known), found.verdict, found.baselines, ())
+    assert "reactions_mN" not in summary["load_cases"]["press/pressed"]
+    (material, modulus), *_ = known.young_moduli.items()
+    for name, told in summary["parameters_95"].items():
+        if name.endswith("young_modulus"):
+            p = next(p for p in found.model.parameters if p.name == name)
+            assert told["unit"] == f"× {material}" and told["estimate"] == pytest.approx(p.value / modulus)
 
 
 def test_files_and_page_tell_predicted_minus_measured(press: Press) -> None:

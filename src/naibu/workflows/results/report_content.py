@@ -190,23 +190,22 @@ def parameter_label(name: str) -> str:
 
 
 def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[ParameterRow, ...]:
-    """Return estimates with 95 % intervals, given values with a note."""
+    """Return estimates with 95 % intervals, given values with a note; moduli are multiples of one of them where none is known in kPa."""
     rows = []
     for p in model.parameters:
         if p.name in names or (p.fixed and p.name.endswith("young_modulus")):
             low, high = model.interval(p.name)
             low = -np.inf if np.isinf(high) else low
-            note = (
-                "" if not p.fixed else ("given" if model.known_materials.scale_is_absolute else "sets the scale: moduli are ratios to it")
-            )
-            rows.append(ParameterRow(p.name, parameter_label(p.name), p.value, low, high, p.unit, note))
+            note = "" if not p.fixed else ("given" if model.reference is None else "sets the scale: moduli are ratios to it")
+            factor, unit = model.shown(p)
+            rows.append(ParameterRow(p.name, parameter_label(p.name), factor * p.value, factor * low, factor * high, unit, note))
     return tuple(rows)
 
 
 def undetermined(model: CalibratedModel, names: Sequence[str], priors: ParameterSet | None = None) -> tuple[str, ...]:
     """Return, in words, what the data do not determine about the parameters `names`; `priors` tells what was assumed of them."""
     out = []
-    if not model.known_materials.scale_is_absolute and not any(p.fixed for p in model.parameters if p.name.endswith(": young_modulus")):
+    if not model.known_materials.scale_is_absolute and model.reference is None:
         out.append(
             "The stiffness follows from the weight that bends the object, at the density of water and the stated size; "
             "whatever else holds it down, such as a base that sticks, would look like a smaller modulus."
@@ -233,8 +232,9 @@ def _undetermined(p: Parameter, model: CalibratedModel, assumed: Parameter | Non
             return f"at least {low:.3f}; the data do not distinguish it from incompressible."
         return f"the data leave it open between {low:.2f} and 0.5."
     if np.isfinite(p.prior_sd) and sd > WEAK * p.prior_sd:
-        before = "" if assumed is None else f"; {assumed.value:.3g} {p.unit}".rstrip() + " was assumed beforehand"
-        return f"the data hardly determine it; {p.value:.3g} {p.unit}".rstrip() + f" was found{before}."
+        factor, unit = model.shown(p)
+        before = "" if assumed is None else f"; {factor * assumed.value:.3g} {unit}".rstrip() + " was assumed beforehand"
+        return f"the data hardly determine it; {factor * p.value:.3g} {unit}".rstrip() + f" was found{before}."
     if p.name.endswith("friction") and high > 4.0 * p.value:
         return f"known only to lie between {low:.2g} and {high:.2g}; where surfaces do not slip, a larger friction looks the same."
     return ""
