@@ -170,10 +170,14 @@ def _identification_summary(
 ) -> dict[str, Any]:
     load_cases = {}
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
-        load_cases[load_case.name] = _figures(accuracy(load_case.specimen, fit)) | {
-            "baselines_rms_3d_mm": dict(baselines.get(load_case.name, {})),
-            "linear_solver": fit.solution.linear_solver,
-        } | _reactions(model, load_case.specimen, fit.solution)
+        load_cases[load_case.name] = (
+            _figures(accuracy(load_case.specimen, fit))
+            | {
+                "baselines_rms_3d_mm": dict(baselines.get(load_case.name, {})),
+                "linear_solver": fit.solution.linear_solver,
+            }
+            | _reactions(model, load_case.specimen, fit.solution)
+        )
     rows = {f"{r.experiment}/{r.state}": {"rms_3d_mm": r.rms_mm, "markers": r.marker_count} for r in left_out}
     found = {p.name: _estimate(model, p) for p in model.parameters}
     return {
