@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from naibu.core.arrays import FloatArray, IntArray, as_points
 from naibu.core.errors import InputError
 
-# Empirical values, judged by tests/imaging/markers/linking/test_motion_coherence.py: measured motions find 97 % of their markers again, permuted
-# labels less than 45 %
+# Empirical values, judged by tests/imaging/markers/linking/test_motion_coherence.py: measured motions find 97 % of their markers again,
+# permuted labels less than 45 %
 NEIGHBOURS = {2: 8, 3: 10}
 FEWEST = {2: 6, 3: 8}  # markers from which on a motion is judged
 FOUND_AGAIN = 0.5
