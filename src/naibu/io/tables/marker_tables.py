@@ -293,7 +293,7 @@ def _unrecognised(path: Path, header: list[str]) -> str:
     lost = [name for name in REQUIRED if name not in found]
     where = f"{path}: cannot recognise the columns of {', '.join(words[name] for name in lost)} among {', '.join(header)}"
     unnumbered = "; tables without common numbers are for naibu track" if lost == ["marker"] else ""
-    return f'{where}; rename them to {", ".join(lost)} (in Python columns={{"{lost[0]}": ...}} does){unnumbered}'
+    return f'{where}; call them {", ".join(lost)} (in Python columns={{"{lost[0]}": ...}} does){unnumbered}'
 
 
 def _label(where: str, text: str) -> int:

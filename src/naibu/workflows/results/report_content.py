@@ -324,11 +324,11 @@ def prediction_report(model: CalibratedModel, prediction: Prediction) -> Report:
     """Gather everything that a prediction's page shows."""
     p, names = prediction, shared_names(model)
     label = f"{p.specimen.experiment.name}/{p.state}"
-    view = prediction_scene(p, "also used to identify" if label in model.load_cases else "predicted unseen")
+    view = prediction_scene(p, "also used to identify" if fitted_too(model, p) else "predicted unseen")
     table = Table("Measured against predicted markers", _ACCURACY_COLUMNS, (_accuracy_row(label, accuracy(p.specimen, p.fit, p.residual)),))
     return Report(
         title=f"Prediction of {label}",
-        headline=_prediction_headline(p),
+        headline=_prediction_headline(model, p),
         verdict=VerdictNote(f"The model is doubtful. {model.reservation}", sound=False) if model.reservation else None,
         scenes=(view,),
         accuracy=table if p.registered else None,
@@ -341,7 +341,14 @@ def prediction_report(model: CalibratedModel, prediction: Prediction) -> Report:
     )
 
 
-def _prediction_headline(p: Prediction) -> tuple[str, ...]:
+def fitted_too(model: CalibratedModel, p: Prediction) -> str:
+    """What a prediction of a state says that the model was identified from; empty for any other state."""
+    if f"{p.specimen.experiment.name}/{p.state}" not in model.load_cases:
+        return ""
+    return "The model was identified from this state too: the distance is that of the fit, and no test of the model."
+
+
+def _prediction_headline(model: CalibratedModel, p: Prediction) -> tuple[str, ...]:
     what = {"side_plates": "side plates {} mm apart", "bar": "the bar {} mm above the base"}.get(
         p.specimen.experiment.loading.kind, "the plate {} mm above the base"
     )
@@ -352,6 +359,7 @@ def _prediction_headline(p: Prediction) -> tuple[str, ...]:
     lead = f"The markers of {label} are predicted to {a.total:.2f} mm (RMS, 3-D), with {place}."
     return (
         lead,
+        *filter(None, (fitted_too(model, p),)),
         f"Residuals are {a.noise_units:.2f} times the stated measurement noise, after a rigid registration of the scan.",
         p.interval,
     )
