@@ -9,7 +9,7 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from naibu.cli.identifying import FIELD_FILES
-from naibu.cli.shell.console import say
+from naibu.cli.shell.console import WARNING, say
 from naibu.cli.shell.described import Flag, Out, Overwrite
 from naibu.cli.shell.run_record import found, wrote
 from naibu.cli.shell.verbs import MARKERS, verb
@@ -92,7 +92,7 @@ def _predict_markers(
     model: Path, experiment: str, state: str | None, height_mm: float | None, heights_from_markers: bool, out: Path, overwrite: bool
 ) -> None:
     from naibu.workflows import predict as predict_workflow
-    from naibu.workflows.results.report_content import accuracy
+    from naibu.workflows.results.report_content import accuracy, fitted_too
 
     result = predict_workflow.predict(
         model, experiment, state=state, height_mm=height_mm, heights_from_markers=heights_from_markers, out=out, overwrite=overwrite
@@ -103,6 +103,8 @@ def _predict_markers(
         a = accuracy(result.specimen, result.fit, result.residual)
         rms = f"RMS x {a.x:.3f}, y {a.y:.3f}, z {a.z:.3f}, 3-D {a.total:.3f} mm"
         say(f"{a.markers} markers: {rms} ({a.noise_units:.2f} times the noise)")
+        if told := fitted_too(result.model, result):
+            say(told, WARNING)
     say(result.interval)
     wrote(*(out / name for name in ("predicted.html", "predicted.csv", "summary.json")))
     say(f"Predicted at {result.platen_position_mm:.2f} mm: {out / 'predicted.csv'}   page: {out / 'predicted.html'}")

@@ -83,6 +83,8 @@ def test_encodings_of_spreadsheets_are_read(encoding: str, tmp_path: Path) -> No
     [
         ("", ["empty"]),
         ("a,b,c\n1,2,3\n", ["cannot recognise the columns", "a, b, c", "columns="]),
+        ("marker,x,y\n1,2,3\n", ["cannot recognise the columns of z among marker, x, y; call them z_mm"]),
+        ("x,y,z\n1,2,3\n", ["columns of the marker's number among x, y, z", "naibu track"]),
         ("id,x,y,z\n", ["no rows follow"]),
         ("id,x,y,z\n1,abc,2,3\n", ["line 2, column 'x' = 'abc'", "not a number"]),
         ("id,x,y,z\n1,inf,2,3\n", ["column 'x' = 'inf'"]),

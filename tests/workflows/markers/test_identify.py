@@ -28,18 +28,20 @@ from naibu.core.errors import ConvergenceError, InputError, WorkerLostError
 from naibu.core.experiment import Experiment
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.prediction import cross_validation as folds
 from naibu.identification.verdict import Explanation
 from naibu.io.experiment_folder.state_csv import parse_state_csv
 from naibu.io.files import atomic
+from naibu.viewer.result_page.page import report_html
 from naibu.viewer.result_page.payload import report_json
 from naibu.viewer.result_page.reading import report_from_json
 from naibu.workflows import predict, report
 from naibu.workflows.markers import cross_validation, identify
 from naibu.workflows.markers.cross_validation import left_out_in_turn
 from naibu.workflows.parallel.worker_count import Workers
-from naibu.workflows.results.report_content import load_case_scene, prediction_scene
-from naibu.workflows.results.result_folder import CHECKPOINT_FILE, MODEL_FILE, read_model
+from naibu.workflows.results.report_content import fitted_too, load_case_scene, prediction_report, prediction_scene
+from naibu.workflows.results.result_folder import CHECKPOINT_FILE, MODEL_FILE, _identification_summary, read_model
 from naibu.workflows.results.search_checkpoint import SearchCheckpoint
 
 STATE = {"press": ["pressed"]}
@@ -93,6 +95,18 @@ def test_results_are_complete(press: Press) -> None:
     np.testing.assert_allclose(plate, np.negative(table), atol=1e-4 * abs(table[2]))
 
 
+def test_ratios_are_not_written_as_forces_and_kilopascals(press: Press) -> None:
+    found = press.identification
+    known = KnownMaterials(found.model.known_materials.young_moduli, scale_is_absolute=False)
+    summary = _identification_summary(found.calibration, replace(found.model, known_materials=known), found.verdict, found.baselines, ())
+    assert "reactions_mN" not in summary["load_cases"]["press/pressed"]
+    (material, modulus), *_ = known.young_moduli.items()
+    for name, told in summary["parameters_95"].items():
+        if name.endswith("young_modulus"):
+            p = next(p for p in found.model.parameters if p.name == name)
+            assert told["unit"] == f"× {material}" and told["estimate"] == pytest.approx(p.value / modulus)
+
+
 def test_files_and_page_tell_predicted_minus_measured(press: Press) -> None:
     calibration = press.identification.calibration
     fit, trial = calibration.match.fits[0], calibration.load_cases[0]
@@ -138,6 +152,9 @@ def test_every_marker_is_predicted(press: Press, tmp_path: Path) -> None:
     assert prediction.platen_position_mm == pytest.approx(PLATEN_POSITIONS_MM["pressed_more"], abs=0.5)
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["registered_to_measured"] and not summary["used_to_identify"]
+    assert not fitted_too(prediction.model, prediction) and "no test of the model" not in pages[0]
+    known_state = replace(prediction.model, load_cases=("press/pressed_more",))
+    assert "no test of the model" in report_html(prediction_report(known_state, prediction))
     measured = {int(r["marker"]): [float(r[f"{a}_mm"]) for a in "xyz"] for r in rows(press.folder / "pressed_more.csv")}
     error = np.array([[float(r[f"{a}_mm"]) for a in "xyz"] for r in table]) - np.array([measured[int(r["marker"])] for r in table])
     assert summary["rms_3d_mm"] == pytest.approx(np.sqrt((error**2).sum(axis=1).mean()), abs=2e-3)

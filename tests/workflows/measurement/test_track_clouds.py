@@ -74,6 +74,8 @@ def test_clouds_that_do_not_correspond_are_refused(gel: Cloud, tables: tuple[Pat
         np.save(other, PIXEL * points)
         with pytest.raises(InputError, match=rf"other\.npy against free\.csv: .*({words})"):
             track_clouds(tables[0], other, out=tmp_path / "out")
+    with pytest.raises(InputError, match=r"free\.csv against free\.csv: .*same positions.*given twice"):
+        track_clouds(tables[0], tables[0], out=tmp_path / "out")
     assert not (tmp_path / "out" / "field.h5").exists()
 
 

@@ -61,6 +61,20 @@ def test_what_is_said_of_a_parameter_agrees_with_its_interval(parameter: Paramet
     assert low <= parameter.value <= high
 
 
+def test_moduli_are_multiples_where_none_is_known() -> None:
+    stiff = Parameter("stiff: young_modulus", 200.0, "kPa", fixed=True)
+    soft, spring = Parameter("soft: young_modulus", 50.0, "kPa", "log"), Parameter("soft on table: friction", 10.0, "kPa/mm", "log")
+    parameters, covariance = ParameterSet.of([soft, spring, stiff]), np.diag([0.01, 0.01])
+    names = [soft.name, spring.name]
+    for absolute, factor, unit in ((True, 1.0, "kPa"), (False, 1.0 / 200.0, "× stiff")):
+        known = KnownMaterials({"stiff": 200.0}, absolute)
+        model = CalibratedModel(ModelSettings(), parameters, covariance, NoiseModel(), 1.0, known, ())
+        found = {row.name: row for row in parameter_rows(model, names)}
+        assert [found[p.name].unit for p in (soft, spring, stiff)] == [unit, f"{unit}/mm", unit]
+        assert [found[p.name].estimate for p in (soft, spring, stiff)] == [factor * p.value for p in (soft, spring, stiff)]
+        assert found[soft.name].lower == pytest.approx(factor * 50.0 * np.exp(-0.1959964))
+
+
 def test_bounds_are_physical_however_little_is_known() -> None:
     for sd in (5.0, 70.0, 1e6):
         low, high = model_of(RATIO, sd).interval(RATIO.name)

@@ -14,6 +14,7 @@ from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
+from naibu.identification.from_markers.specimen.parameter_names import young_modulus
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.predictive_uncertainty import PredictiveUncertainty, predictive_uncertainty
 from naibu.identification.prediction.stored_model import check_stored_model
@@ -68,6 +69,24 @@ class CalibratedModel:
         if self.predictive is not None:
             return self.predictive
         return PredictiveUncertainty(tuple(p.name for p in self.parameters.free), self.covariance, 0.0, max(1.0, self.noise_factor), {})
+
+    @property
+    def reference(self) -> tuple[str, float] | None:
+        """The material whose modulus is the unit of all others, and the number, kPa, that stands for it; None where moduli are in kPa.
+
+        Moduli are in kPa where one was given, or where all are sought from the weight of the object.
+        """
+        fixed = {p.name for p in self.parameters if p.fixed}
+        relative = not self.known_materials.scale_is_absolute
+        named = [(m, e) for m, e in self.known_materials.young_moduli.items() if relative and young_modulus(m) in fixed]
+        return named[0] if named else None
+
+    def shown(self, p: Parameter) -> tuple[float, str]:
+        """Return the factor from a parameter to the number told of it, and its unit: multiples where no modulus is known."""
+        if self.reference is None or not p.unit.startswith("kPa"):
+            return 1.0, p.unit
+        material, modulus = self.reference
+        return 1.0 / modulus, f"× {material}{p.unit.removeprefix('kPa')}"
 
     @classmethod
     def of(cls, calibration: Calibration, provenance: Mapping[str, Any] | None = None) -> CalibratedModel:

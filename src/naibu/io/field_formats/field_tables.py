@@ -10,6 +10,7 @@ import numpy as np
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
+from naibu.io.experiment_folder.reader import META_FILE
 from naibu.io.field_formats import tecplot
 from naibu.io.field_formats.spam_tiff import require_converged
 from naibu.io.tables.point_tables import PointTable, assembled, columns_of, read_point_table
@@ -38,7 +39,8 @@ def read(source: Path, *, unit: str | None = None, spacing_mm: Sequence[float] |
     """
     table = _tecplot(source, unit) if source.suffix.lower() == ".dat" else read_point_table(source, unit=unit)
     if table.vectors is None:
-        raise InputError(f"{source.name}: has no columns of displacements; it needs {NEEDED}, or names like them")
+        folder = f"; of an experiment with markers give the folder, {source.parent}" if (source.parent / META_FILE).exists() else ""
+        raise InputError(f"{source.name}: has no columns of displacements; it needs {NEEDED}, or names like them{folder}")
     d = table.points.shape[1]
     if table.in_voxels and spacing_mm is None:
         raise InputError(f"{source.name}: is a table of SPAM, in voxels; give spacing_mm, the size of a voxel along x, y, z")

@@ -100,6 +100,11 @@ def import_markers(
         raise InputError(f"{source}: {error}") from error
 
 
+def state_name(file_name: str) -> str:
+    """Return the name of a state from that of a file, with ``_`` for spaces and other characters that it may not have."""
+    return re.sub(r"[^\w.-]+", "_", file_name).strip("_") or "state"
+
+
 def write_markers(path: str | os.PathLike[str], markers: Markers) -> Path:
     """Write markers as a table ``marker,x_mm,y_mm,z_mm,status,note``; the file is written atomically.
 
@@ -271,10 +276,7 @@ def _located(path: Path, rows: list[tuple[int, list[str]]], columns: Mapping[str
             return at, where
     header = rows[0][1]
     if columns is None:
-        raise InputError(
-            f"{path}: cannot recognise the columns of marker number, x, y and z among {', '.join(header)}; "
-            'name them: columns={"marker": ..., "x_mm": ..., "y_mm": ..., "z_mm": ...}'
-        )
+        raise InputError(_unrecognised(path, header))
     absent = next((n for n in wanted if n not in columns), None)
     if absent:
         raise InputError(f"columns does not name {absent!r}; add the column of {path} that contains it")
@@ -282,6 +284,16 @@ def _located(path: Path, rows: list[tuple[int, list[str]]], columns: Mapping[str
     close = difflib.get_close_matches(lost, header, n=1)
     mend = f"did you mean {close[0]!r}?" if close else f"it has {', '.join(header)}"
     raise InputError(f"{path}: there is no column {lost!r}; {mend}")
+
+
+def _unrecognised(path: Path, header: list[str]) -> str:
+    """Which columns are missing, what to call them, and what else takes positions without numbers."""
+    words = {"marker": "the marker's number", "x_mm": "x", "y_mm": "y", "z_mm": "z"}
+    found = guessed_columns(path, header)
+    lost = [name for name in REQUIRED if name not in found]
+    where = f"{path}: cannot recognise the columns of {', '.join(words[name] for name in lost)} among {', '.join(header)}"
+    unnumbered = "; tables without common numbers are for naibu track" if lost == ["marker"] else ""
+    return f'{where}; call them {", ".join(lost)} (in Python columns={{"{lost[0]}": ...}} does){unnumbered}'
 
 
 def _label(where: str, text: str) -> int:

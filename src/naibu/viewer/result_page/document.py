@@ -23,7 +23,7 @@ def document(report: Report, scenes: Sequence[Scene]) -> str:
         links += '<li><a href="#provenance">How this was computed</a></li>'
         body += provenance_section(report.provenance)
     header = f'{_headline(report)}<nav aria-label="Contents"><ul>{links}</ul></nav>'
-    footer = "Lengths in mm, pressures and moduli in kPa. This page is self-contained: it loads nothing from the network."
+    footer = "Lengths in mm, other units beside the numbers. This page is self-contained: it loads nothing from the network."
     return page_html(
         report.title, header, body, footer, data=MarkerView(tuple(scenes)).data() if scenes else "", script=SCRIPT if scenes else ""
     )

@@ -35,6 +35,8 @@ def load_experiment(source: Source) -> Experiment:
     if isinstance(source, Experiment):
         return source
     path, name = require_usable_path(source), str(source)
+    if path.is_file():
+        raise InputError(f"{path} is a file, but an experiment is a folder with a {META_FILE} in it; give the folder, {path.parent}")
     if path.exists():
         return read_experiment(path)
     if name in datasets.names():

@@ -13,11 +13,13 @@ from scipy.spatial import cKDTree
 
 from naibu.core.arrays import FloatArray, require_lengths
 from naibu.core.errors import InputError
-from naibu.core.experiment import Loading, Shape
+from naibu.core.experiment import Experiment, Loading, Shape
 from naibu.core.markers import Markers
+from naibu.identification.from_markers.checks.marker_checks import check_markers
 from naibu.imaging.markers.linking.motion_coherence import require_coherent, strays_named
 from naibu.imaging.markers.tracking import FEWEST_COMMON
-from naibu.io.tables.marker_tables import import_markers, write_experiment_folder
+from naibu.io.experiment_folder.reader import META_FILE, read_experiment
+from naibu.io.tables.marker_tables import import_markers, state_name, write_experiment_folder
 from naibu.io.tables.table_cells import MM_PER_UNIT
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.markers.tilted_tables import UprightTables, Vertical, upright_tables
@@ -58,7 +60,7 @@ def import_tables(
     Returns
     -------
     tuple of str
-        What should be looked at: markers that move unlike their neighbours.
+        What should be looked at: markers that move unlike their neighbours, what `naibu.identify` will doubt or refuse (exchanged states).
 
     Raises
     ------
@@ -73,8 +75,38 @@ def import_tables(
     if description.get("xy_step_mm") and description.get("z_step_mm"):
         steps = upright.turned_lengths(description["xy_step_mm"], description["z_step_mm"])
         description |= {"xy_step_mm": steps[0], "z_step_mm": steps[1]}
+    description["stated_mm"] = {state_name(name): height for name, height in (description.get("stated_mm") or {}).items()}
+    experiment = _rehearsed(out, upright.tables, description, dict(zip(tables, (initial, *loaded), strict=True)))
     write_experiment_folder(out, upright.tables[first], {name: upright.tables[name] for name in others}, **description)
-    return (*notes, *upright.notes)
+    return (*notes, *upright.notes, *_doubts(experiment))
+
+
+def _doubts(experiment: Experiment) -> list[str]:
+    """What `naibu.identify` will doubt or refuse: the description that follows from the options can still be corrected in the folder."""
+    try:
+        return [doubt.text for doubt in check_markers([experiment])]
+    except InputError as error:
+        return [f"naibu identify will refuse this: {error}"]
+
+
+def _rehearsed(
+    out: str | os.PathLike[str],
+    tables: Mapping[str, Markers],
+    description: Mapping[str, Any],
+    sources: Mapping[str, str | os.PathLike[str]],
+) -> Experiment:
+    """Return the experiment that the folder `out` will hold; what is wrong with a table is told of the file that it came from."""
+    first, *others = tables
+    with TemporaryDirectory() as place:
+        folder = Path(place) / (Path(out).resolve().name or "experiment")
+        try:
+            write_experiment_folder(folder, tables[first], {name: tables[name] for name in others}, **description)
+            return read_experiment(folder)
+        except InputError as error:
+            told = str(error).replace(f" in {META_FILE}", "")
+            for name, source in sources.items():
+                told = told.replace(str(folder / f"{name}.csv"), str(source))
+            raise InputError(told.replace(f"{place}{os.sep}", "")) from error
 
 
 def rehearsed_import(
@@ -131,7 +163,7 @@ def preview_tables(
 
 def _read(initial: str | os.PathLike[str], loaded: Sequence[str | os.PathLike[str]], unit: str | None, shape: Shape) -> dict[str, Markers]:
     """Return the markers of all states by name, the unloaded one first."""
-    names = [INITIAL, *(Path(table).stem for table in loaded)]
+    names = [INITIAL, *(state_name(Path(table).stem) for table in loaded)]
     if len(set(names)) < len(names):
         raise InputError(f"two tables would both be the state {max(names, key=names.count)!r}; rename one file")
     require_lengths(size_mm=shape.size_mm)

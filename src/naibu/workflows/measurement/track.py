@@ -17,7 +17,7 @@ from naibu.imaging.markers.tracking import FEWEST_COMMON, TrackedMarkers, track_
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
-from naibu.io.tables.marker_tables import write_experiment_folder, write_markers
+from naibu.io.tables.marker_tables import state_name, write_experiment_folder, write_markers
 from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_marker_motion
@@ -209,7 +209,7 @@ def _states(scans: Sequence[str | os.PathLike[str]]) -> list[str]:
     for scan in scans[1:]:
         name = Path(scan).name
         ending = next((e for e in ENDINGS if name.lower().endswith(e)), Path(scan).suffix)
-        names.append(name[: len(name) - len(ending)] or name)
+        names.append(state_name(name[: len(name) - len(ending)] or name))
     if len(set(names)) < len(names):
         raise InputError(f"two scans would both be the state {max(names, key=names.count)!r}; rename one")
     return names
@@ -225,10 +225,11 @@ def _written(
     d, (xy_sd, z_sd) = description, tracked.typical_sd_mm
     upright = upright_tables(dict(zip(tracked.names, tracked.markers, strict=True)), d.vertical, shape=d.shape, loading=d.loading)
     xy_sd, z_sd = upright.turned_lengths(xy_sd, z_sd)
+    stated = {state_name(name): height for name, height in (d.stated_mm or {}).items()}
     first, *others = tracked.names
     write_experiment_folder(
         target, upright.tables[first], {n: upright.tables[n] for n in others}, title=d.title, shape=d.shape, loading=d.loading,
-        layers=d.layers, stated_mm=d.stated_mm, xy_sd_mm=xy_sd, z_sd_mm=z_sd, overwrite=overwrite,
+        layers=d.layers, stated_mm=stated, xy_sd_mm=xy_sd, z_sd_mm=z_sd, overwrite=overwrite,
     )  # fmt: skip
     return [target / "meta.toml", *(target / f"{n}.csv" for n in tracked.names)], (
         *([upright.told] if upright.told else []),

@@ -130,6 +130,7 @@ def track_clouds(
     report_progress(progress, "linking particles")
     first, second = clouds
     try:
+        _require_two_states(first, second)
         motion = particle_motion(first.points, second.points, reference_sd_mm=first.sd, deformed_sd_mm=second.sd)
     except InputError as error:
         raise InputError(f"{names[1]} against {names[0]}: {error}") from error
@@ -147,6 +148,15 @@ def track_clouds(
         Chapter("tracking", "Particles linked between two states", (_section(names, rows, motion),), settings), folder
     )
     return CloudRun(motion, rows, page, (page, *files, numbers))
+
+
+def _require_two_states(first: PointCloud, second: PointCloud) -> None:
+    """Refuse a plane cloud beside one in space, and one cloud given twice."""
+    axes = [", ".join("xyz"[: c.points.shape[1]]) for c in (first, second)]
+    if axes[0] != axes[1]:
+        raise InputError(f"both must be of the same dimension, and one has {axes[1]}, the other {axes[0]}; give the same columns in both")
+    if np.array_equal(first.points, second.points):
+        raise InputError("both hold the same positions, so that nothing moved; is one file given twice?")
 
 
 def _rows(clouds: Sequence[PointCloud], motion: ParticleMotion) -> tuple[tuple[str, Cell], ...]:
@@ -172,7 +182,7 @@ def _rows(clouds: Sequence[PointCloud], motion: ParticleMotion) -> tuple[tuple[s
         along = strain[:, k, k]
         if np.isfinite(along).any():
             low, middle, high = np.nanpercentile(along, (5.0, 50.0, 95.0))
-            rows.append((f"strain E_{axis}{axis}: 5 %, median, 95 %", f"{low:.4f}, {middle:.4f}, {high:.4f}"))
+            rows.append((f"strain E_{axis}{axis}: 5th percentile, median, 95th", f"{low:.4f}, {middle:.4f}, {high:.4f}"))
     doubt = motion.gradient_sd[trusted][np.isfinite(motion.gradient[trusted])]
     if len(doubt):
         rows.append(("SD of a displacement gradient, median", f"{np.median(doubt):.2g}"))

@@ -190,23 +190,22 @@ def parameter_label(name: str) -> str:
 
 
 def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[ParameterRow, ...]:
-    """Return estimates with 95 % intervals, given values with a note."""
+    """Return estimates with 95 % intervals, given values with a note; moduli are multiples of one of them where none is known in kPa."""
     rows = []
     for p in model.parameters:
         if p.name in names or (p.fixed and p.name.endswith("young_modulus")):
             low, high = model.interval(p.name)
             low = -np.inf if np.isinf(high) else low
-            note = (
-                "" if not p.fixed else ("given" if model.known_materials.scale_is_absolute else "sets the scale: moduli are ratios to it")
-            )
-            rows.append(ParameterRow(p.name, parameter_label(p.name), p.value, low, high, p.unit, note))
+            note = "" if not p.fixed else ("given" if model.reference is None else "sets the scale: moduli are ratios to it")
+            factor, unit = model.shown(p)
+            rows.append(ParameterRow(p.name, parameter_label(p.name), factor * p.value, factor * low, factor * high, unit, note))
     return tuple(rows)
 
 
 def undetermined(model: CalibratedModel, names: Sequence[str], priors: ParameterSet | None = None) -> tuple[str, ...]:
     """Return, in words, what the data do not determine about the parameters `names`; `priors` tells what was assumed of them."""
     out = []
-    if not model.known_materials.scale_is_absolute and not any(p.fixed for p in model.parameters if p.name.endswith(": young_modulus")):
+    if not model.known_materials.scale_is_absolute and model.reference is None:
         out.append(
             "The stiffness follows from the weight that bends the object, at the density of water and the stated size; "
             "whatever else holds it down, such as a base that sticks, would look like a smaller modulus."
@@ -233,8 +232,9 @@ def _undetermined(p: Parameter, model: CalibratedModel, assumed: Parameter | Non
             return f"at least {low:.3f}; the data do not distinguish it from incompressible."
         return f"the data leave it open between {low:.2f} and 0.5."
     if np.isfinite(p.prior_sd) and sd > WEAK * p.prior_sd:
-        before = "" if assumed is None else f"; {assumed.value:.3g} {p.unit}".rstrip() + " was assumed beforehand"
-        return f"the data hardly determine it; {p.value:.3g} {p.unit}".rstrip() + f" was found{before}."
+        factor, unit = model.shown(p)
+        before = "" if assumed is None else f"; {factor * assumed.value:.3g} {unit}".rstrip() + " was assumed beforehand"
+        return f"the data hardly determine it; {factor * p.value:.3g} {unit}".rstrip() + f" was found{before}."
     if p.name.endswith("friction") and high > 4.0 * p.value:
         return f"known only to lie between {low:.2g} and {high:.2g}; where surfaces do not slip, a larger friction looks the same."
     return ""
@@ -324,11 +324,11 @@ def prediction_report(model: CalibratedModel, prediction: Prediction) -> Report:
     """Gather everything that a prediction's page shows."""
     p, names = prediction, shared_names(model)
     label = f"{p.specimen.experiment.name}/{p.state}"
-    view = prediction_scene(p, "also used to identify" if label in model.load_cases else "predicted unseen")
+    view = prediction_scene(p, "also used to identify" if fitted_too(model, p) else "predicted unseen")
     table = Table("Measured against predicted markers", _ACCURACY_COLUMNS, (_accuracy_row(label, accuracy(p.specimen, p.fit, p.residual)),))
     return Report(
         title=f"Prediction of {label}",
-        headline=_prediction_headline(p),
+        headline=_prediction_headline(model, p),
         verdict=VerdictNote(f"The model is doubtful. {model.reservation}", sound=False) if model.reservation else None,
         scenes=(view,),
         accuracy=table if p.registered else None,
@@ -341,7 +341,14 @@ def prediction_report(model: CalibratedModel, prediction: Prediction) -> Report:
     )
 
 
-def _prediction_headline(p: Prediction) -> tuple[str, ...]:
+def fitted_too(model: CalibratedModel, p: Prediction) -> str:
+    """What a prediction of a state says that the model was identified from; empty for any other state."""
+    if f"{p.specimen.experiment.name}/{p.state}" not in model.load_cases:
+        return ""
+    return "The model was identified from this state too: the distance is that of the fit, and no test of the model."
+
+
+def _prediction_headline(model: CalibratedModel, p: Prediction) -> tuple[str, ...]:
     what = {"side_plates": "side plates {} mm apart", "bar": "the bar {} mm above the base"}.get(
         p.specimen.experiment.loading.kind, "the plate {} mm above the base"
     )
@@ -352,6 +359,7 @@ def _prediction_headline(p: Prediction) -> tuple[str, ...]:
     lead = f"The markers of {label} are predicted to {a.total:.2f} mm (RMS, 3-D), with {place}."
     return (
         lead,
+        *filter(None, (fitted_too(model, p),)),
         f"Residuals are {a.noise_units:.2f} times the stated measurement noise, after a rigid registration of the scan.",
         p.interval,
     )

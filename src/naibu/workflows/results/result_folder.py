@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from naibu.core.errors import InputError
+from naibu.core.parameters import Parameter
 from naibu.identification.from_fields.identified.identified_body import FORMAT as FORMAT_OF_FIELDS
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_markers.calibration import Calibration
@@ -169,13 +170,16 @@ def _identification_summary(
 ) -> dict[str, Any]:
     load_cases = {}
     for load_case, fit in zip(calibration.load_cases, calibration.match.fits, strict=True):
-        load_cases[load_case.name] = _figures(accuracy(load_case.specimen, fit)) | {
-            "baselines_rms_3d_mm": dict(baselines.get(load_case.name, {})),
-            "linear_solver": fit.solution.linear_solver,
-            "reactions_mN": _reactions(load_case.specimen, fit.solution),
-        }
+        load_cases[load_case.name] = (
+            _figures(accuracy(load_case.specimen, fit))
+            | {
+                "baselines_rms_3d_mm": dict(baselines.get(load_case.name, {})),
+                "linear_solver": fit.solution.linear_solver,
+            }
+            | _reactions(model, load_case.specimen, fit.solution)
+        )
     rows = {f"{r.experiment}/{r.state}": {"rms_3d_mm": r.rms_mm, "markers": r.marker_count} for r in left_out}
-    found = {p.name: {"estimate": p.value, "from": low, "to": high, "unit": p.unit} for p, low, high in _intervals(model)}
+    found = {p.name: _estimate(model, p) for p in model.parameters}
     return {
         "verdict": verdict.to_dict() | {"left_out_markers": list(verdict.outliers)},
         "status": calibration.match.status.name,
@@ -188,8 +192,9 @@ def _identification_summary(
     }
 
 
-def _intervals(model: CalibratedModel) -> list[tuple[Any, float, float]]:
-    return [(p, *model.interval(p.name)) for p in model.parameters]
+def _estimate(model: CalibratedModel, p: Parameter) -> dict[str, Any]:
+    (low, high), (factor, unit) = model.interval(p.name), model.shown(p)
+    return {"estimate": factor * p.value, "from": factor * low, "to": factor * high, "unit": unit}
 
 
 def _figures(a: Accuracy) -> dict[str, float | int]:
@@ -203,8 +208,11 @@ def _figures(a: Accuracy) -> dict[str, float | int]:
     }
 
 
-def _reactions(body: Specimen, solution: Solution) -> dict[str, list[float]]:
-    return {name: np.asarray(force).tolist() for name, force in body.reactions(solution).items()}
+def _reactions(model: CalibratedModel, body: Specimen, solution: Solution) -> dict[str, Any]:
+    """Forces of the rigid bodies on the object, which ratios of moduli do not tell."""
+    if model.reference is not None:
+        return {}
+    return {"reactions_mN": {name: np.asarray(force).tolist() for name, force in body.reactions(solution).items()}}
 
 
 def _text(data: object) -> str:
@@ -249,7 +257,7 @@ def write_prediction(folder: Path, model: CalibratedModel, prediction: Predictio
         "interval": p.interval,
         "notes": [*p.specimen.experiment.loading.assumed, *p.notes],
         "linear_solver": p.fit.solution.linear_solver,
-        "reactions_mN": _reactions(p.specimen, p.fit.solution),
+        **_reactions(model, p.specimen, p.fit.solution),
         "inputs": {p.specimen.experiment.name: dict(p.specimen.experiment.input_hashes)},
         "provenance": dict(model.provenance),
     }

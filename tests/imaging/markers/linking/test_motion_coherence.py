@@ -91,3 +91,12 @@ def test_chance_links_lose_their_confidence() -> None:
         assert link_markers(cloud.reference, blurred).confidence.mean() < 0.9
     except InputError as error:
         assert "no common structure" in str(error)
+
+
+def test_an_affine_motion_that_a_table_rounds_has_no_strays() -> None:
+    """Neighbours that are off by rounding only, some by nothing, must not reduce a fit to the few that lie in one plane."""
+    grid = np.stack(np.meshgrid(*[np.arange(10.0, 51.0, 10.0)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    moved = np.round(grid * [np.sqrt(4 / 3), np.sqrt(4 / 3), 0.75], 3)
+    found = motion_coherence(grid, moved)
+    assert found.residual.max() < 1e-3
+    assert not len(found.strays)

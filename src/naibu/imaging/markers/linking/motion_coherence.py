@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from naibu.core.arrays import FloatArray, IntArray, as_points
 from naibu.core.errors import InputError
 
-# Empirical values, judged by tests/imaging/markers/test_motion_coherence.py: measured motions find 97 % of their markers again, permuted
-# labels less than 45 %
+# Empirical values, judged by tests/imaging/markers/linking/test_motion_coherence.py: measured motions find 97 % of their markers again,
+# permuted labels less than 45 %
 NEIGHBOURS = {2: 8, 3: 10}
 FEWEST = {2: 6, 3: 8}  # markers from which on a motion is judged
 FOUND_AGAIN = 0.5
@@ -26,6 +26,7 @@ VOLUMES, SPANS = (0.25, 4.0), (0.4, 2.5)  # local ratio of volumes, and ratio of
 STRAY, BEYOND = 0.8, 6.0  # residual of a stray marker: in spacings, and in medians of all residuals
 COHERENT = (0.3, 0.6)  # median residual up to which links are coherent, and from which on they are chance
 ROUNDS = 4  # of the robust fit
+ROUNDING = 1e-3  # of the distance to the neighbours: what a table rounds off says nothing about which of them to believe
 FLAT = 0.02  # ratio of the extents of neighbours below which they lie in a plane or on a line
 MOST = 3000  # markers that are judged at most, evenly chosen
 
@@ -179,7 +180,7 @@ def _predicted(x: FloatArray, y: FloatArray, judged: IntArray) -> tuple[FloatArr
         weighted = rows * weight[:, :, None]
         fit = np.linalg.solve(np.swapaxes(weighted, 1, 2) @ rows + ridge, np.swapaxes(weighted, 1, 2) @ b)
         off = np.linalg.norm(b - rows @ fit, axis=2)
-        weight = 1.0 / (1.0 + (off / (2.0 * np.median(off, axis=1, keepdims=True) + 1e-12 * scale[:, :, 0])) ** 2)
+        weight = 1.0 / (1.0 + (off / (2.0 * np.median(off, axis=1, keepdims=True) + ROUNDING * scale[:, :, 0])) ** 2)
     extents = np.linalg.svd(rows[:, :, 1:] - rows[:, :, 1:].mean(axis=1, keepdims=True), compute_uv=False)
     flat = extents[:, -1] < FLAT * extents[:, 0]
     volumes = np.linalg.det(fit[:, 1:] / scale)
