@@ -26,6 +26,7 @@ from naibu.core.arrays import FloatArray
 from naibu.mechanics import IndenterVelocity, LatticeEngine, box_mask, classic_lattice, lattice_parameters, spherical_indenter
 from naibu.mechanics.lattices.model.contact_surface import PER_RADIUS, SHARED, THINNEST
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
+from naibu.workflows.interactive.touchable_models import LATTICE_TOLERANCE
 
 SIDE_MM, MASS_KG, STEP_S = 80.0, 0.63, 1e-3
 CLASSES = ("short", "normal", "long")
@@ -70,9 +71,9 @@ def _quantiles(taken: FloatArray) -> Iterable[tuple[str, FloatArray]]:
     return zip(("cpu", "wall"), np.quantile(taken, (0.0, 0.5, 0.99), axis=1).T, strict=True)
 
 
-def sessions(n: int, steps: int, radius: float) -> None:
-    engine = dough(n, STEP_S, 1e-2)
-    print(f"{n + 1}^3 nodes, sphere of {radius:g} mm")
+def sessions(n: int, steps: int, radius: float, tolerance: float) -> None:
+    engine = dough(n, STEP_S, tolerance)
+    print(f"{n + 1}^3 nodes, sphere of {radius:g} mm, tolerance of the solver {tolerance:g}")
     with engine.session(constrained=held(engine)) as free:
         free.step(steps=5)
         row("no sphere", timed(lambda k: free.step(), steps))
@@ -170,6 +171,7 @@ def main() -> None:
     parser.add_argument("--sizes", default="8,16", help="voxels an edge")
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--radius", type=float, default=10.0)
+    parser.add_argument("--tolerance", type=float, default=LATTICE_TOLERANCE, help="of the solver; by default that of naibu live")
     parser.add_argument("--curves", action="store_true")
     parser.add_argument("--given", action="store_true", help="a given pressure instead of a sphere; no steps are timed")
     chosen = parser.parse_args()
@@ -179,7 +181,7 @@ def main() -> None:
         given()
         return
     for n in [int(size) for size in chosen.sizes.split(",")]:
-        sessions(n, chosen.steps, chosen.radius)
+        sessions(n, chosen.steps, chosen.radius, chosen.tolerance)
     if chosen.curves:
         curves()
 

@@ -23,9 +23,9 @@ from naibu.mechanics import Assembler, LatticeEngine, box_mask, classic_lattice,
 from naibu.meshing import boundary_faces, box, to_tetra
 from naibu.simulation import FiniteElementBody, ForceLimits, LatticeBody, SimulatedDevice
 from naibu.workflows import DeviceRecord, TouchableModel, drive_live_simulation, touched_loop
+from naibu.workflows.interactive.touchable_models import LATTICE_STEP_S, LATTICE_TOLERANCE
 
 EDGE_MM = 80.0
-STEP_S = 1e-3
 
 
 def hand(t: float) -> FloatArray:
@@ -41,7 +41,8 @@ def cube(nodes: int) -> LatticeBody:
     parameters = lattice_parameters(lattice, dict.fromkeys(classes, 10.0), dict.fromkeys(classes, 5.0), dict.fromkeys(classes, 10.0))
     tetra = to_tetra(lattice_mesh(lattice))
     lowest = np.flatnonzero(lattice.points[:, 2] < 1e-9)
-    return LatticeBody(LatticeEngine.of(lattice, parameters, step=STEP_S), boundary_faces(tetra).faces, tetra.cells, lowest)
+    engine = LatticeEngine.of(lattice, parameters, step=LATTICE_STEP_S, tolerance=LATTICE_TOLERANCE)
+    return LatticeBody(engine, boundary_faces(tetra).faces, tetra.cells, lowest)
 
 
 def gel(nodes: int) -> FiniteElementBody:

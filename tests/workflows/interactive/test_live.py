@@ -19,10 +19,10 @@ from touched_lattice import touched_lattice
 
 from naibu.core.errors import InputError
 from naibu.io.vtk_files import write_vtu
-from naibu.mechanics import spherical_indenter
+from naibu.mechanics import IndenterVelocity, spherical_indenter
 from naibu.meshing import box
 from naibu.meshing.cutting.swept_blade import swept_blade
-from naibu.simulation import FiniteElementBody, InteractiveSimulation, RealTimeLoop
+from naibu.simulation import FiniteElementBody, InteractiveSimulation, LatticeBody, RealTimeLoop
 from naibu.workflows import MeshMaterial, TouchableModel, live, tools_for, touchable
 from naibu.workflows.interactive.live import LiveSimulation
 
@@ -487,3 +487,23 @@ def test_a_taken_port_is_named() -> None:
             live("cube-pushing", port=port, ready=lambda _: None)
     with pytest.raises(InputError, match="between 0 and 65535"):
         live("cube-pushing", port=70000, ready=lambda _: None)
+
+
+def test_steps_of_a_lattice_on_the_live_page_are_solved_closely_enough() -> None:
+    """Forces of a sphere that goes down and to and fro, beside those of a solver that ends three hundred times later."""
+    body = touchable("dough-pressed-by-sphere").body
+    assert isinstance(body, LatticeBody)
+    high = body.points.max(axis=0)
+    ball = spherical_indenter((*body.points.mean(axis=0)[:2], high[2] + 10.0), 10.0, static_friction=0.3, kinetic_friction=0.3)
+    forces = []
+    for engine in (body.engine, replace(body.engine, tolerance=1e-4)):
+        found = []
+        with replace(body, engine=engine).session() as session:
+            session.press([*body.fixtures, ball])
+            still = [IndenterVelocity() for _ in body.fixtures]
+            for t in 1e-3 * np.arange(600):
+                way = [0.0, 0.0, -10.0] if t < 0.4 else [40.0 * np.cos(9.0 * t), 30.0 * np.sin(7.0 * t), 10.0 * np.sin(15.0 * t)]
+                found.append(session.step(np.zeros((2, 3)), [*still, IndenterVelocity(way)]).indenters[0, -1])
+        forces.append(np.array(found))
+    apart = np.linalg.norm(forces[0] - forces[1], axis=1) / np.linalg.norm(forces[1], axis=1).max()
+    assert np.sqrt((apart**2).mean()) < 1e-3 and np.quantile(apart, 0.99) < 2e-3

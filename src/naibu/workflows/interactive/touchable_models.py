@@ -43,6 +43,7 @@ from naibu.workflows.results.result_folder import MODEL_FILE, read_any_model
 from naibu.workflows.studies.lattice_study import NAMED, PreparedStudy, prepared_study
 
 LATTICE_STEP_S = 1e-3
+LATTICE_TOLERANCE = 3e-2  # of the solver: forces on a sphere stay within some 1e-4 of their range, for a quarter fewer iterations than 1e-2
 BASE_FRACTION = 1e-3  # of the height of a mesh: nodes this near to its lowest one are held
 TOOL_FRICTION = 0.3
 MOST_LISTED = 8  # zones whose moduli a heading lists
@@ -197,7 +198,7 @@ def _lattice(prepared: PreparedStudy) -> TouchableModel:
     still = [b for b in study.bodies if b.motion is None and b.drive is None]
     tied = [b.indenter for b in still if b.tied_until_s is not None]
     fixtures = tuple(b.indenter for b in still if b.tied_until_s is None)
-    engine = LatticeEngine.of(study.lattice, study.parameters, step=LATTICE_STEP_S)
+    engine = LatticeEngine.of(study.lattice, study.parameters, step=LATTICE_STEP_S, tolerance=LATTICE_TOLERANCE)
     supported = nodes_touching(study.lattice.points, tied) if still else _lowest(study.lattice.points)
     cells = to_tetra(prepared.mesh).cells
     body = LatticeBody(engine, surface_of(study.lattice).triangles, cells, supported, fixtures, study.external_force)
