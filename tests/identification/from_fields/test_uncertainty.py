@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from naibu.core.displacement_field import DisplacementField
+from naibu.identification.from_fields.assumptions import Assumption, effects
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, logarithms, young_and_poisson
@@ -93,6 +94,21 @@ def test_what_is_not_determined_is_infinite_and_said() -> None:
     assert not np.isfinite(found.standard_deviations()).all()
     words = report(zones, at.point.theta, found)
     assert len(words) == 193 and sum("do not determine" in w for w in words) > 100
+
+
+def test_a_modulus_known_to_no_factor_has_no_bounds_and_no_numbers() -> None:
+    """A standard deviation of 700 in a logarithm gave intervals from 0 to infinity beside sentences with numbers such as 1e+220 kPa."""
+    zones = Zones(np.array([0, 1]), ("muscle", "fat"), np.full(2, np.nan), np.full(2, np.nan))
+    theta = np.log([10.0, 2.0, 7.0, 5.0])
+    found = Uncertainty.of(np.diag([1e4, 2e-6, 1e4, 1e2]))
+    young, _ = intervals(theta, found)
+    assert np.isfinite(young[0]).all() and young[1].tolist() == [0.0, np.inf]
+    other = Assumption("with small strain", np.array([0.01, 500.0, 0.0, 0.0]), 0.0)
+    words = (*report(zones, theta, found), *effects((other,), zones, theta, young))
+    assert words[1] == "fat: the measurements do not determine its moduli."
+    assert words[2].endswith("mu of fat up; any value fits.")
+    assert "muscle +1 %" in words[3] and "fat" not in words[3]
+    assert effects((other,), zones, theta, np.array([[0.0, np.inf]] * 2)) == ()
 
 
 def test_words_follow_the_numbers() -> None:

@@ -11,7 +11,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.workflows.fields.block_mesh import block_mesh
-from naibu.workflows.fields.measured_load_case import doubts_of_field, measured_load_case
+from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, measured_load_case
 
 SIDE_MM = 40.0
 INSIDE = Volume.from_array(np.ones((20, 20, 20), np.uint8), spacing_mm=(2.0,) * 3, origin_mm=(1.0,) * 3)
@@ -52,6 +52,15 @@ def test_a_field_without_displacements_is_refused_as_such() -> None:
     mesh, cells = block_mesh(INSIDE, np.ones(INSIDE.shape, np.int64), {1: "gel"}, 8.0)
     with pytest.raises(InputError, match="none of its 300 points has a displacement"):
         measured_load_case(mesh, cells, INSIDE, field, "push")
+
+
+@pytest.mark.parametrize(("kept", "told"), [(1.0, ""), (0.9, ""), (0.7, "30 % of its points lie outside of the object")])
+def test_a_mask_that_shows_a_part_of_what_was_measured_is_told(kept: float, told: str) -> None:
+    x = np.repeat(np.linspace(1.0, SIDE_MM - 1.0, 20), 10)
+    points = np.column_stack([x, *np.random.default_rng(1).uniform(1.0, SIDE_MM - 1.0, (2, 200))])
+    cropped = Volume.from_array(np.ones((20, 20, round(20 * kept)), np.uint8), spacing_mm=(2.0,) * 3, origin_mm=(1.0,) * 3)
+    words = " ".join(beyond_object("push", DisplacementField.from_arrays(points, 0.1 * points), cropped))
+    assert (told in words) if told else not words
 
 
 def test_copies_of_a_measurement_count_once() -> None:

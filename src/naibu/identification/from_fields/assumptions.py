@@ -114,7 +114,7 @@ def covariance_of(found: tuple[Assumption, ...], size: int) -> FloatArray:
 
 
 def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray, within: FloatArray) -> tuple[str, ...]:
-    """Say what other assumptions would do to the moduli of the zones, at most three zones each, and where that leaves their intervals.
+    """Say what other assumptions would do to moduli that are determined, at most three each, and where that leaves their intervals.
 
     Parameters
     ----------
@@ -128,12 +128,11 @@ def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray, with
         Intervals of Young's modulus, kPa.
     """
     young, poisson = young_and_poisson(theta)
-    lines = []
-    for one in found:
+    lines, bounded = [], np.flatnonzero(np.isfinite(within[:, 1]))
+    for one in found if len(bounded) else ():
         other, ratio = young_and_poisson(one.applied(theta))
         rows = [
-            f"{name} {100 * (a / b - 1):+.2g} %, Poisson's ratio {c - d:+.3f}"
-            for name, a, b, c, d in zip(zones.names[:3], other, young, ratio, poisson, strict=False)
+            f"{zones.names[i]} {100 * (other[i] / young[i] - 1):+.2g} %, Poisson's ratio {ratio[i] - poisson[i]:+.3f}" for i in bounded[:3]
         ]
         out = [name for name, e, (low, high) in zip(zones.names, other, within, strict=True) if not low <= e <= high]
         left = f" {_named(out)} would leave the interval, which takes this assumption as given." if out else ""

@@ -20,6 +20,7 @@ from naibu.identification.verdict import UNDETERMINED
 
 UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the information below which a combination is not determined at all
 PROBES = 24
+UNBOUNDED = 1e3  # a factor between estimate and bound beyond which the data give no bound
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
 POISSON_POORLY = 0.1
 NOT_DETERMINED = "not determined"
@@ -165,11 +166,14 @@ def intervals(theta: FloatArray, found: Uncertainty, level: float = 0.95) -> tup
     """Return the bounds of Young's modulus (k, 2), kPa, and of Poisson's ratio (k, 2) that hold the truth with a probability `level`.
 
     Errors are normal in a logarithm: of E, and of mu / kappa before what the size of elements added to it was taken off. Towards
-    incompressibility they are normal in mu / kappa itself: where its lower bound is below 0, Poisson's ratio may be 0.5.
+    incompressibility they are normal in mu / kappa itself: where its lower bound is below 0, Poisson's ratio may be 0.5. A modulus known
+    to no factor of `UNBOUNDED` has no bounds.
     """
     k, quantile = len(theta) // 2, float(ndtri(0.5 + 0.5 * level))
     of_young, _ = found.of_young_and_poisson(theta)
-    young = young_and_poisson(theta)[0][:, None] * np.exp(quantile * of_young[:, None] * np.array([-1.0, 1.0]))
+    half = quantile * of_young[:, None]
+    half = np.where(half > np.log(UNBOUNDED), np.inf, half)
+    young = young_and_poisson(theta)[0][:, None] * np.exp(half * np.array([-1.0, 1.0]))
     sd = quantile * found.standard_deviations()[k:]
     stretch = np.ones(k) if found.stretch is None else found.stretch[k:]
     with np.errstate(over="ignore", divide="ignore"):
@@ -201,7 +205,7 @@ def report(
     for i, name in enumerate(zones.names):
         how = grade(of_young[i], usable=usable, sure=sure, apart=name in apart)
         line = _sentence(name, young[i], of_young[i], within[0][i], poisson[i], of_poisson[i], within[1][i], unit, how)
-        lines.append(line + ("" if budget is None or not np.isfinite(of_young[i]) else _parts(budget, i, zones.count)))
+        lines.append(line + ("" if budget is None or not np.isfinite(within[0][i, 1]) else _parts(budget, i, zones.count)))
     return (*lines, _worst(zones, found))
 
 
@@ -230,7 +234,7 @@ def _sentence(
     unit: str,
     how: str,
 ) -> str:
-    if not np.isfinite(of_young):
+    if not np.isfinite(e[1]):
         return f"{name}: the measurements do not determine its moduli."
     text = f"{name}: Young's modulus {young:.4g}{unit} is {how} (standard error {100 * of_young:.2g} %, "
     text += f"95 % interval {e[0]:.4g} to {e[1]:.4g}{unit})"
@@ -257,7 +261,9 @@ def _worst(zones: Zones, found: Uncertainty) -> str:
     towards = ", ".join(f"{names[i]} {'up' if worst[i] * worst[parts[0]] > 0 else 'down'}" for i in parts)
     sd = 1.0 / np.sqrt(max(float(values[0]), 1e-300)) * float(np.abs(vectors[:, 0]).max())
     several = "together " if len(parts) > 1 else ""
-    much = f"by {100 * sd:.2g} %" if sd < 1.0 else f"{np.exp(min(sd, 300.0)):.2g} times"
+    if sd > np.log(UNBOUNDED):
+        return f"Least determined among {2 * k} numbers: {towards}; any value fits."
+    much = f"by {100 * sd:.2g} %" if sd < 1.0 else f"{np.exp(sd):.2g} times"
     return f"Least determined among {2 * k} numbers: {towards}; {several}{much} before the fit exceeds the noise."
 
 

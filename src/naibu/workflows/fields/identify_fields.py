@@ -46,7 +46,7 @@ from naibu.workflows.fields.block_mesh import (
     sizes_of_voxels,
 )
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
-from naibu.workflows.fields.measured_load_case import doubts_of_field, relative_deformation
+from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, relative_deformation
 from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ScannedObject, identified_on_smaller_cubes
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import output_folder
@@ -218,7 +218,8 @@ def identify_fields(
     coarse = blurred(cubes.left_out, cubes.wrong, corrected=corrected)
     doubts = tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
     coarse += cubes.noise
-    notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
+    cropped = tuple(told for name, field in measured for told in beyond_object(name, field, inside))
+    notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer, *cropped)
     result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
@@ -307,6 +308,8 @@ def table_of_assumptions(result: FieldIdentification) -> Table:
         for one in found.assumptions:
             young, poisson = young_and_poisson(one.applied(found.theta))
             for name, e, nu, (low, high) in zip(found.zones.names, young, poisson, inside, strict=True):
+                if not np.isfinite(high):  # of a modulus that may be anything, a change to first order says nothing
+                    continue
                 rows.append((one.text, name, float(e), float(nu), "yes" if low <= e <= high else "no"))
     columns = ("other assumption", "zone", f"Young's modulus, {result.unit}", "Poisson's ratio", "modulus within the interval above")
     return Table("Moduli under other assumptions", columns, tuple(rows))
@@ -326,7 +329,9 @@ def _card(name: str, unit: str, young: float, low: float, high: float, how: str)
     """Return the card of a zone; where its modulus is not determined, the best fit is no result and stands behind the interval."""
     label = f"Young's modulus, {name}"
     if how in (NOT_DETERMINED, MESH_DEPENDENT):
-        return Card(label, how, f"95 % from {low:.3g} to {high:.3g} {unit}, best fit {young:.3g}")
+        return Card(
+            label, how, f"95 % from {low:.3g} to {high:.3g} {unit}, best fit {young:.3g}" if np.isfinite(high) else "any value fits"
+        )
     return Card(label, f"{young:.3g} {unit}", f"95 % from {low:.3g} to {high:.3g}, {how}")
 
 

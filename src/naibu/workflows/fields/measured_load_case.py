@@ -20,6 +20,7 @@ FEWEST_POINTS = 20
 THINNEST = 0.1  # of a cell: points that span less along a direction do not tell how displacements change along it
 MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
 LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
+MOST_BEYOND = 0.2  # of the points outside of the object: more than its rim
 ZERO = 5, 0.01  # points, and part of them, with a displacement of exactly zero: no measurement is that by chance
 TINY_DEFORMATION = 1e-4  # so little is usual for waves and interferometry, and for scans and particles is a sign of another unit
 
@@ -135,6 +136,20 @@ def doubts_of_field(name: str, field: DisplacementField) -> tuple[str, ...]:
             "nothing: leave these points out. Only of what a simulation holds fast it is right."
         )
     return tuple(told)
+
+
+def beyond_object(name: str, field: DisplacementField, inside: Volume) -> tuple[str, ...]:
+    """Say which part of a field lies outside of the object, the voxels of `inside` that are not zero, where that is more than its rim."""
+    at = field.at_points()
+    index = np.round(inside.to_index(at.points[at.valid])).astype(int)[:, ::-1]
+    within = ((index >= 0) & (index < inside.shape)).all(axis=1)
+    within[within] = inside.values[tuple(index[within].T)] != 0
+    if (share := 1.0 - float(within.mean())) <= MOST_BEYOND:
+        return ()
+    return (
+        f"{name}: {100 * share:.0f} % of its points lie outside of the object that the mask or the zones show, and are not used. "
+        "Does that volume show all of the object that was measured, on the grid of the scan?",
+    )
 
 
 def _require_deformation(name: str, field: DisplacementField) -> None:
