@@ -67,9 +67,9 @@ def biases(fit: CorrelationFit, c: FloatArray, bending: FloatArray, dilatation: 
 def bias_covariance(fit: CorrelationFit, bias: Sequence[Float32Array], sampled: FloatArray) -> FloatArray:
     """Return the covariance (m, 3, 3), mm^2 along the axes of the volume, of the bias by the penalties, whose sizes `biases` returns.
 
-    `sampled` (m, 3, 3) is that of the samples. They vary most in the directions that the intensities leave open, such as along layers and in
-    tissue without texture, and there a penalty prevails, too. One part of the variance lies as they do, one along what penalising once
-    more takes away, and the rest along every axis alike.
+    `sampled` (m, 3, 3) is that of the samples. They vary most in the directions that the intensities leave open, such as along layers, and
+    there a penalty prevails, too. One part of the variance lies as they do, one along what penalising once more takes away, and the rest
+    along every axis alike.
 
     It is taken at voxels: the middle of a cell at the surface may lie far outside of the object, where splines extrapolate.
     """
