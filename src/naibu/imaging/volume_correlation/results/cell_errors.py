@@ -14,10 +14,13 @@ from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, sep
 VOXELS_PER_CELL = 6  # at which the random fields are evaluated: splines vary little within a cell
 SHARED = 0.7  # empirical, cells: SD of the window in which cells share their samples
 REMAINING = 5.0  # empirical: last steps that a cell which has not converged may still be away from the solution
-# empirical: standard deviation along every axis of the bias by the penalties of bending and of dilatation, in lengths of the change that
-# penalising the field once more makes. Errors of legs and chests exceed what the samples say by 4 to 5 such lengths in three axes, and
-# along the change only in part; that by dilatation shows in legs, most beside bones, that by bending in chests
-BENDING_BIAS, DILATATION_BIAS, BIAS_TOLERANCE = 1.9, 2.2, 0.03
+# empirical: standard deviation of the bias by the penalties of bending and of dilatation along an axis, root mean square over three, in
+# lengths of the change that penalising the field once more makes. That by dilatation shows in legs, most beside bones, that by bending in
+# chests
+BENDING_BIAS, DILATATION_BIAS, BIAS_TOLERANCE = 2.0, 2.3, 0.03
+# empirical: parts of the variance of the bias along the change that penalising once more makes, and as the samples lie. Both say in which
+# direction a penalty prevails, as along the skin in fat without texture; along every axis alike, regions were too narrow there
+ALONG, OPEN = 0.5, 0.4
 # empirical: mean square of the residuals of a cell, in variances of the noise, beyond which structures lie at the wrong place there. Edges
 # in legs reach 8 in one cell of a hundred; lungs that slide by 5 to 17 mm along the chest wall 8 to 100 in one cell of twenty
 MISPLACED = 8.0
@@ -61,20 +64,29 @@ def biases(fit: CorrelationFit, c: FloatArray, bending: FloatArray, dilatation: 
     return tuple(np.float32(factor) * system.solved(load, BIAS_TOLERANCE)[0] for factor, load in zip(factors, loads, strict=True))
 
 
-def bias_variance(fit: CorrelationFit, bias: Sequence[Float32Array]) -> FloatArray:
-    """Return the variance (m,), mm^2 along every axis, of the bias by the penalties, whose sizes `biases` returns.
+def bias_covariance(fit: CorrelationFit, bias: Sequence[Float32Array], sampled: FloatArray) -> FloatArray:
+    """Return the covariance (m, 3, 3), mm^2 along the axes of the volume, of the bias by the penalties, whose sizes `biases` returns.
+
+    `sampled` (m, 3, 3) is that of the samples. They vary most in the directions that the intensities leave open, such as along layers, and
+    there a penalty prevails, too. One part of the variance lies as they do, one along what penalising once more takes away, and the rest
+    along every axis alike.
 
     It is taken at voxels: the middle of a cell at the surface may lie far outside of the object, where splines extrapolate.
     """
     system = fit.system
     cells, at = _some_voxels(fit)
-    full, square = np.zeros((*system.active.shape, 3)), np.zeros(len(at))
+    full, m = np.zeros((*system.active.shape, 3)), len(system.cells)
+    total = np.zeros((m, 3, 3))
     for coefficients in bias:
         full[system.active] = coefficients
-        square += (system.grid.values(full, fit.level.index[at] * fit.level.spacing) ** 2).sum(axis=1)
-    m = len(system.cells)
-    total, count = (fit.windowed(np.bincount(cells, w, minlength=m).astype(float), SHARED) for w in (square, None))
-    return np.asarray(total / count)
+        moved = system.grid.values(full, fit.level.index[at] * fit.level.spacing)
+        np.add.at(total, cells, moved[:, :, None] * moved[:, None, :])
+    count = fit.windowed(np.bincount(cells, minlength=m).astype(float), SHARED)
+    along = fit.windowed(total, SHARED) / count[:, None, None]
+    size, open_ = (np.trace(v, axis1=1, axis2=2)[:, None, None] for v in (along, sampled))
+    rest = OPEN * sampled / np.maximum(open_, 1e-30) + (1.0 - ALONG - OPEN) / 3.0 * np.eye(3)
+    # `biases` are as large as the deviation along every axis
+    return np.asarray(3.0 * (ALONG * along + size * rest))
 
 
 def misplacement_variance(fit: CorrelationFit, misfit: FloatArray, unlike: BoolArray | None = None) -> FloatArray:

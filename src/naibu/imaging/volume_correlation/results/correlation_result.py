@@ -18,7 +18,7 @@ from naibu.imaging.volume_correlation.common_content import CommonContent
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.results.cell_errors import (
     REMAINING,
-    bias_variance,
+    bias_covariance,
     biases,
     misplacement_variance,
     per_cell,
@@ -50,7 +50,8 @@ class CorrelationResult:
         Standard deviation of a component of the Green-Lagrange strain in the middle of every cell, root mean square over the components;
         NaN where there is no object.
     cell_bias : ndarray, shape (CZ, CY, CX)
-        Variance along every axis, mm^2, of the bias by the penalties, a part of the covariance; NaN where there is no object.
+        Variance, mm^2, of the bias by the penalties along an axis, in the mean over three, a part of the covariance; NaN where there is no
+        object.
     cell_misplacement : ndarray, shape (CZ, CY, CX)
         Variance along every axis, mm^2, of displacements that would explain residuals far above the noise, a part of the covariance: 0
         where structures lie on one another after registration, NaN where there is no object.
@@ -298,19 +299,21 @@ def collected(
     -----
     The samples hold the error of fields as rough, and as far from constant volume, as the penalties assume. That of others is a bias, whose
     size is estimated by smoothing the field once more, as in Tukey's twicing :cite:p:`tukey1977`, and by penalising its dilatation once
-    more. Its direction is not: what a penalty took from the true field was not parallel to what it takes from its estimate. Both are
-    therefore added as variances along every axis. So is what a part may have swollen by while noise hides it, and what large
-    residuals tell of structures that no smooth field brings together, such as those on either side of organs that slide on each other.
+    more. Its direction is known only in part: what a penalty took from the true field was not parallel to what it takes from its estimate,
+    but is large where the samples are, too, in the directions that the intensities leave open: see `bias_covariance`. What a part may have
+    swollen by while noise hides it, and what large residuals tell of structures that no smooth field brings together, such as those on
+    either side of organs that slide on each other, are added as variances along every axis.
     """
     system, level = fit.system, fit.level
     # the errors first: they take memory for every voxel of the object, and the fields below stay
     bias = biases(fit, c, bending, dilatation)
     remaining = np.where(fit.moving, (REMAINING * fit.last_steps_mm) ** 2, 0.0)
     misplaced = misplacement_variance(fit, misfit, content.unlike)
-    biased = bias_variance(fit, bias) + hidden[0]
-    variance = biased + remaining + misplaced
-    spread = sampled_covariance(fit, samples) + variance[:, None, None] * np.eye(3)
-    covariance = per_cell(system.grid, fit, spread)
+    sampled = sampled_covariance(fit, samples)
+    taken = bias_covariance(fit, bias, sampled)
+    biased = np.trace(taken, axis1=1, axis2=2) / 3.0 + hidden[0]
+    variance = hidden[0] + remaining + misplaced
+    covariance = per_cell(system.grid, fit, sampled + taken + variance[:, None, None] * np.eye(3))
     strain_sd = np.sqrt(
         strain_variance(fit, c, samples, bias) + hidden[1] + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
     )
