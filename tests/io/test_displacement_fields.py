@@ -80,3 +80,10 @@ def test_files_without_a_field_are_told(tmp_path: Path) -> None:
             read_field(tmp_path / name)
     with pytest.raises(InputError, match=r"written as \.h5"):
         write_field(tmp_path / "a.npz", at_points())
+
+
+def test_a_folder_with_a_field_leads_to_the_field(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).uniform(0.0, 10.0, (5, 3))
+    write_field(tmp_path / "field.h5", DisplacementField.from_arrays(points, 0.1 * points))
+    with pytest.raises(InputError, match=r"is a folder; give the displacement field in it, .*field\.h5$"):
+        read_field(tmp_path)

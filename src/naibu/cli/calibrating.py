@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
@@ -124,7 +125,8 @@ def _write_example(folder: Path, seed: int, overwrite: bool) -> None:
 
     written = write_calibration_example(folder, seed=seed, overwrite=overwrite)
     wrote(*written)
-    say(f"Wrote {', '.join(map(str, written))}. Run: naibu calibrate {written[0]} --shapes {written[1]} --forces {written[2]}")
+    study, shapes, forces = (quote(str(path)) for path in written)
+    say(f"Wrote {', '.join(map(str, written))}. Run: naibu calibrate {study} --shapes {shapes} --forces {forces}")
 
 
 def _show(run: LatticeCalibration) -> None:

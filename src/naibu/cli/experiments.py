@@ -7,6 +7,7 @@ import time
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import Parameter
@@ -364,4 +365,4 @@ def import_tables(
         return
     wrote(out)
     before = "" if about["layers"] else "Describe layers and materials in its meta.toml, then run"
-    say(f"Wrote {out}. {before or 'Run'}: naibu identify {out}")
+    say(f"Wrote {out}. {before or 'Run'}: naibu identify {quote(str(out))}")

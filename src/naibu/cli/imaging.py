@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
@@ -84,7 +85,9 @@ def sense(
     say(f"{run.seconds:.1f} s. Page: {files[0]}   fields: {', '.join(str(p.name) for p in files[1:])}")
     if min(run.pair.reference.shape) > 1:
         say(
-            f"Stiffness: naibu identify {out / 'field.h5'} --zones LABELS -k 'label 1=10 kPa', a volume of labels, one of them known", "dim"
+            f"Stiffness: naibu identify {quote(str(out / 'field.h5'))} --zones LABELS -k 'label 1=10 kPa', where LABELS is a volume of "
+            "labels, one of them known",
+            "dim",
         )
 
 
@@ -261,7 +264,8 @@ def track(
     if description is None:
         say("Give --size-mm X Y Z, --layer and --stated-mm to make an experiment folder that 'naibu identify' takes.", "dim")
     else:
-        say(f"{'Run' if description.layers else 'Describe layers and materials in its meta.toml, then run'}: naibu identify {out}")
+        before = "Run" if description.layers else "Describe layers and materials in its meta.toml, then run"
+        say(f"{before}: naibu identify {quote(str(out))}")
 
 
 def _track_clouds(
@@ -278,7 +282,7 @@ def _track_clouds(
     wrote(run.page, *run.files)
     print_table(f"{clouds[0].name} -> {clouds[1].name}", ("quantity", "value"), run.rows)
     say(f"Page: {run.page}   field: {out / 'field.h5'}   links: {out / 'links.csv'}")
-    say(f"With a volume of zones: naibu identify {out / 'field.h5'} --zones labels.nii.gz --known 'gel=12 kPa'", "dim")
+    say(f"With a volume of zones: naibu identify {quote(str(out / 'field.h5'))} --zones labels.nii.gz --known 'gel=12 kPa'", "dim")
 
 
 @verb(MARKERS, "track-sequence ultrasound.tif --pixel-mm 0.1 --diameter-mm 1 --frame-rate-hz 30")

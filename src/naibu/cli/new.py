@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Literal
 
 from naibu.cli.shell.console import say
@@ -32,7 +33,7 @@ def new(kind: KindName = "experiment", *, out: Out | None = None, overwrite: Ove
     place = out or Path("my_experiment" if kind == "experiment" else "my_study.toml")
     files = written(kind, place, overwrite=overwrite)
     wrote(*files)
-    say(f"Wrote {', '.join(str(file) for file in files)}. Edit {files[0]}, and run: naibu {_next(kind)} {place}")
+    say(f"Wrote {', '.join(str(file) for file in files)}. Edit {files[0]}, and run: naibu {_next(kind)} {quote(str(place))}")
 
 
 def _next(kind: str) -> str:

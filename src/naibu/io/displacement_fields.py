@@ -32,6 +32,7 @@ from naibu.io.tables.table_cells import MM_PER_UNIT, unit_factor, without_unit
 
 FORMAT = "naibu displacement field 1"
 FRAME = "LPS, mm; the material at x in the reference configuration is found at x + vector"
+FIELD_FILE = "field.h5"  # in the folders that naibu sense, track and predict write
 TABLES = (*TEXT, *EXCEL, ".dat")
 ENDINGS = (".h5", ".mha", ".mhd", ".nrrd", ".nii", ".nii.gz", ".tfm", ".vtu", ".mat", "-Xdisp.tif", *TABLES)
 # what to do with files that are not read, by their ending
@@ -124,6 +125,8 @@ def read_field(
     """
     source = Path(path)
     ending = source.suffix.lower()
+    if source.is_dir() and (source / FIELD_FILE).is_file():
+        raise InputError(f"{source} is a folder; give the displacement field in it, {source / FIELD_FILE}")
     require_lengths(spacing_mm=spacing_mm)
     _require_fitting(source, ending, unit, spacing_mm, node_spacing)
     with guarded_reading(path, "displacement field"):

@@ -121,6 +121,16 @@ def test_uncertain_moduli_widen_the_prediction(folder: Path) -> None:
     assert sds[2] - sds[0] == pytest.approx(100.0 * (sds[1] - sds[0]), rel=1e-6, abs=1e-12)
 
 
+def test_a_modulus_that_is_left_open_is_told_of_the_standard_deviation(folder: Path) -> None:
+    body = read_any_model(folder / "model")
+    assert isinstance(body, IdentifiedBody)
+    loading: dict[str, Any] = {"held": ["z-"], "moved": ["z+=0,0,-1"]}
+    assert not any("leaves open" in note for note in predict_field(body, **loading).notes)
+    data = copy.deepcopy(body.to_dict())
+    data["covariance"][0][0] = 1.0  # of the logarithm: a factor of 7 either way
+    assert any("too small where those of gel" in note for note in predict_field(IdentifiedBody.from_dict(data), **loading).notes)
+
+
 def test_the_command_line(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     def run(*words: str) -> int:
         monkeypatch.setattr(sys, "argv", ["naibu", "predict", str(folder / "model"), *words, "--out", str(tmp_path / "out")])

@@ -205,6 +205,11 @@ def test_scans_on_different_grids_are_refused(folder: Path) -> None:
         measure_displacement(before, after, method="best")  # type: ignore[arg-type]
 
 
+def test_one_scan_given_twice_is_refused(folder: Path) -> None:
+    with pytest.raises(InputError, match=r"hold the same intensities at every voxel.*given twice"):
+        read_pair(folder / "before.mha", folder / "before.mha")
+
+
 def test_a_mask_of_another_scan_is_refused(folder: Path, tmp_path: Path) -> None:
     write_volume(tmp_path / "mask.mha", Volume.from_array(np.ones((3, 3, 3), np.uint8), spacing_mm=(1, 1, 1)))
     with pytest.raises(InputError, match=r"mask\.mha does not lie on the grid of before\.mha: their sizes differ"):

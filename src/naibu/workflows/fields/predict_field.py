@@ -18,6 +18,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.identified.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
+from naibu.identification.verdict import UNDETERMINED
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record, sha256
@@ -287,12 +288,25 @@ def _notes(
     sd = float(np.median(prediction.standard_deviation))
     parts = "moduli, surface, elements and model misfit" if body.covariance is not None else "surface, elements and model misfit"
     notes.append(f"A predicted component is known to {sd:.2g} mm (standard deviation, median: {parts}).")
+    if loose := _undetermined(body):
+        notes.append(
+            f"It follows from moduli near those used, and is too small where those of {', '.join(loose)}, which the identification leaves "
+            "open, are far from them."
+        )
     if body.covariance is None:
         notes.append("The model is a map of moduli cell by cell without a covariance: what its errors do to the prediction is not known.")
     if prediction.strain > EXTRAPOLATED * body.strain:
         ratio = prediction.strain / max(body.strain, 1e-300)
         notes.append(f"This is an extrapolation: the body is deformed {ratio:.2g} times as much as in the identification.")
     return tuple(notes)
+
+
+def _undetermined(body: IdentifiedBody) -> list[str]:
+    """Return the zones whose shear modulus is known to no factor of `UNDETERMINED`, within which a prediction is not linear in it."""
+    if body.covariance is None:
+        return []
+    sd = np.sqrt(np.diag(body.covariance)[: len(body.zones)])
+    return [zone for zone, s in zip(body.zones, sd, strict=True) if 1.96 * s > np.log(UNDETERMINED)]
 
 
 def _written(folder: Path, run: FieldPredictionRun, motions: dict[str, tuple[float, float, float]], inputs: dict[str, str]) -> list[Path]:

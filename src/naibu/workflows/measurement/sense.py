@@ -141,10 +141,15 @@ def read_pair(
     Raises
     ------
     InputError
-        A file that cannot be read, or a mask or truth on another grid.
+        A file that cannot be read, one scan given twice, or a mask or truth on another grid.
     """
     require_lengths(spacing_mm=spacing_mm)
     a, b = (read_volume(p, spacing_mm=spacing_mm, missing=True) for p in (reference, deformed))
+    if np.array_equal(a.values, b.values, equal_nan=True):
+        raise InputError(
+            f"{Path(reference).name} and {Path(deformed).name} hold the same intensities at every voxel, so that nothing moved; "
+            "is one scan given twice?"
+        )
     masks: list[BoolArray | None] = [None, None]
     for k, (path, grid, scan) in enumerate(((mask, a, reference), (deformed_mask, b, deformed))):
         if path is not None:

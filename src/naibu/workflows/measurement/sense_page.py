@@ -113,9 +113,10 @@ def _sentences(run: SenseRun) -> list[str]:
     reserved = (
         "without reservation" if not doubts else "with one reservation, below" if doubts == 1 else f"with {doubts} reservations, below"
     )
+    name = "digital volume correlation" if run.measured.method == "default" else run.measured.method
     sentences = [
         f"Measured in {where}, {reserved}.",
-        f"Method {run.measured.method}, {run.seconds:.1f} s. The object moved by {f['median_displacement_mm']:.2f} mm (median), at most "
+        f"Method: {name}, {run.seconds:.1f} s. The object moved by {f['median_displacement_mm']:.2f} mm (median), at most "
         f"{f['largest_displacement_mm']:.2f} mm; the intensity residual inside it fell from {f['initial_residual_rms']:.4g} to "
         f"{f['residual_rms']:.4g} (root mean square).",
     ]

@@ -114,9 +114,9 @@ def sums_of_blocks(fit: CorrelationFit, inner: BoolArray, edge: int, draws: Iter
     for (i, j), total in zip(UPPER, sums(fit.products).T, strict=True):
         matrix[:, i, j] = matrix[:, j, i] = total
     weight = fit.products[:, [0, 3, 5]].sum(axis=1, dtype=float)
-    total_weight = np.zeros(len(inner))
-    total_weight[inner] = sums(weight)[block, 0]
-    share = (weight / np.maximum(total_weight, 1e-300))[:, None]
+    total_weight = np.ones(len(inner))  # voxels outside of the blocks are not summed
+    total_weight[inner] = np.maximum(sums(weight)[block, 0], 1e-300)
+    share = (weight / total_weight)[:, None]
     root = np.sqrt(fit.weight)
     drawn = np.stack([sums((root * draw)[:, None] * fit.gradient) for draw in draws], axis=2)
     kept = count >= LEAST_VOXELS
