@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.ndimage import uniform_filter1d
 
-from naibu.identification.lattice_calibration.intervals.local_regression import LocalRegression, Pair, regression
+from naibu.identification.lattice_calibration.intervals.local_regression import WORTH, LocalRegression, Pair, Regression, regression
 from naibu.identification.lattice_calibration.least_squares import unsettled_covariance
 from naibu.identification.lattice_calibration.simulated_points import SimulatedPoints
 
-COUNT, PRIOR_SD = 2000, 3.0
+COUNT, PRIOR_SD, ALIKE = 2000, 3.0, 25
 
 
 class Jumping:
@@ -62,6 +63,38 @@ def test_without_jumps_it_is_least_squares() -> None:
 def test_intervals_hold_where_residuals_jump_together() -> None:
     """In 40 draws of three parameters 114 of 120 truths are expected within, or more: what jumps tell is rather under- than overrated."""
     found = [Jumping(seed, [0.5, 1.0, 2.0], 0.03, offset=0.3).estimated() for seed in range(40)]
+    held = np.array([np.abs(error) < 1.96 * sd for error, sd, settled in found if settled])
+    assert len(held) > 0.8 * len(found)
+    assert held.mean() >= 0.93
+
+
+@pytest.mark.parametrize(("promising", "ends"), [(5.0, False), (0.005, True)])
+def test_a_search_whose_steps_bring_nothing_ends_only_where_they_promise_nothing(promising: float, ends: bool) -> None:
+    """Residuals do not change at all here, whatever derivatives say: with steps that fail, chi-squared falls no longer either."""
+    made, zero, step = Jumping(0, [0.0, 0.0], 0.0), np.zeros(2), np.array([-0.05, 0.0])
+    points = SimulatedPoints(made, made)  # type: ignore[arg-type]
+    long = points.simulated([(zero, False)])[0]
+    local = LocalRegression(points, zero, long, zero, PRIOR_SD, 0.03**2 * np.eye(2))
+    local._offset = np.zeros(COUNT)
+    slopes = np.column_stack([promising * long, np.zeros(COUNT)])
+    fit = Regression((step, step), step, 0.03**2 * np.eye(2), slopes, np.ones(COUNT), 1.0, 5)
+    assert (local._move(fit, 0.06**2 * np.eye(2)) < WORTH * 2) is ends
+
+
+class Lacking(Jumping):
+    """Forces that the law lacks for a while, and derivatives of forces that are alike in neighbouring windows."""
+
+    def __init__(self, seed: int):
+        super().__init__(seed, [0.5, 1.0, 2.0], 0.0)
+        forces = slice(COUNT // 2, None)
+        before = self.measured[forces] - self._law(self.truth, fine=True)[forces]
+        self.slopes[forces] = uniform_filter1d(self.slopes[forces], ALIKE, axis=0) * np.sqrt(ALIKE)
+        lack = uniform_filter1d(self.rng.standard_normal(COUNT // 2), ALIKE) * np.sqrt(ALIKE)
+        self.measured[forces] = self._law(self.truth, fine=True)[forces] + before + 2.0 * lack
+
+
+def test_intervals_hold_where_what_forces_lack_is_alike_in_neighbouring_windows() -> None:
+    found = [Lacking(seed).estimated() for seed in range(40)]
     held = np.array([np.abs(error) < 1.96 * sd for error, sd, settled in found if settled])
     assert len(held) > 0.8 * len(found)
     assert held.mean() >= 0.93

@@ -24,7 +24,7 @@ from naibu.mechanics.lattices.simulation.tied_bodies import tied_constraints
 
 QUICK_TOUCHING_S = 0.02  # like `QUICK_S`, in contact, where the first touch of moving indenters is no change of their motion
 
-EXACT = 1e-5  # tolerance of the solver in contact: what it leaves decides where points begin to slip, and shapes and forces jump by that
+EXACT = 1e-4  # tolerance of the solver in contact: what it leaves decides where points begin to slip, and shapes and forces jump by that
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -33,6 +33,7 @@ WIDEST = (0.01, 0.06, 0.24)  # largest one: at least, at first, and at most
 PAYS = 4.0
 ROUNDS = 8
 REACHES = 2.0  # of these deviations, how far a step follows a regression
+PARTS, POOR = (1.0, 0.3), 0.3  # of a step, tried one after the other as long as less than that share of what was promised comes of it
 WORTH = 3.0  # decrease of chi-squared for each parameter that is worth another round
 TOO_FAR = 8.0  # squared, mean over the parameters: points that do not count
 WIDER = 2.0  # standard deviations over those of the points, from which the regression does not reach as far as its interval
@@ -40,6 +41,7 @@ LONGEST = 0.4  # relative change of a value in a round
 CLOSE = 2.0  # standard deviations: a step within them ends the rounds
 FINE = 3  # points with fine steps
 MISFIT = 1.2  # mean square of residuals in units of noise and error of the model, from which both are taken as larger
+STRETCHES = 16  # of forces, in which what they lack is alike
 NEIGHBOURS = (101, 15)  # of points and of forces, whose errors of the model are averaged
 
 
@@ -138,7 +140,9 @@ def regression(
         (np.stack([pairs[k].even for k in near]), 1.0 / len(near)),
         (further, 1.0 / max(len(further) - 1, 1)),
     ]
-    weights = _weights(level, sum(share * (rest**2).sum(axis=0) for rest, share in parts), points)
+    mean_square = sum(share * (rest**2).sum(axis=0) for rest, share in parts)
+    noise = _noise(level, mean_square, points)
+    weights = np.asarray(1.0 / (noise + mean_square), dtype=np.float64)
     uncertain = np.linalg.inv((design * weight[:, None]).T @ design) * weight.mean()  # (p, p), per variance of half a difference
     jumps = float(weights @ (left**2).mean(axis=0))
     told, apparent = np.eye(p), (slopes.T * weights) @ slopes
@@ -151,7 +155,7 @@ def regression(
     slope = told @ slopes.T @ (weights * level) + prior @ (theta - centre)
     gain = covariance @ told @ (slopes.T * weights)
     steps = _limited(hessian, slope), _limited(apparent + prior, slopes.T @ (weights * level) + prior @ (theta - centre))
-    for rest, share in parts:
+    for rest, share in (*parts, (_lacking(level, noise, points), 1.0)):
         moved = rest @ gain.T
         covariance = covariance + share * moved.T @ moved
     limited = about(covariance, np.zeros(p), unsettled_covariance(theta, centre, prior_sd))
@@ -174,15 +178,27 @@ def _limited(hessian: FloatArray, slope: FloatArray) -> FloatArray:
     return np.asarray(step, dtype=np.float64)
 
 
-def _weights(level: FloatArray, mean_square: FloatArray, points: int) -> FloatArray:
-    """Return one over the variance of residuals (n,): noise, as large as the misfit where that is more, and errors of the model."""
+def _noise(level: FloatArray, mean_square: FloatArray, points: int) -> FloatArray:
+    """Return variances of noise (n,), as large as the misfit where that is more; mean squares of model errors are smoothed in place."""
     noise = np.ones(len(level))
     for part, size in zip((slice(points), slice(points, None)), NEIGHBOURS, strict=True):
         if len(level[part]):
             mean_square[part] = uniform_filter1d(mean_square[part], size)
             excess = float((level[part] ** 2 / (1.0 + mean_square[part])).mean())
             noise[part] = excess if excess > MISFIT else 1.0
-    return np.asarray(1.0 / (noise + mean_square))
+    return noise
+
+
+def _lacking(level: FloatArray, noise: FloatArray, points: int) -> FloatArray:
+    """Return what forces lack (m, n), stretch by stretch of time, where it is more than the stated noise and errors of the model.
+
+    It is alike in neighbouring windows, and moves the estimate by more than as much independent noise does: its stretches are taken for
+    independent instead (after :cite:t:`newey1987`).
+    """
+    count = len(level) - points
+    found = np.zeros((STRETCHES, len(level)))
+    found[np.arange(count) * STRETCHES // max(count, 1), points + np.arange(count)] = level[points:]
+    return found if count and noise[-1] > 1.0 else found[:0]
 
 
 def _spurious(design: FloatArray, products: FloatArray, mean: FloatArray) -> FloatArray:
@@ -311,17 +327,25 @@ class LocalRegression:
     def _move(self, fit: Regression, spread: FloatArray) -> float:
         """Move by the better step of a regression, as far as the regression reaches, if residuals as it weighs them get less.
 
-        Returns the decrease of chi-squared, errors of the model not regarded: while it goes on falling, they are not what is left.
+        Where steps bring much less than they promise, shorter ones are tried. Returns the decrease of chi-squared, errors of the model
+        not regarded, or `POOR` of what was promised if that is more: while it goes on falling, or should, they are not what is left. A
+        search that finds no way down is not at its end.
         """
-        trials = []
+        steps = []
         for step in fit.steps:
             away = np.sqrt(float(step @ np.linalg.solve(spread, step)) / len(step))
-            trials.append(self.points.moved(self.theta, step * min(1.0, REACHES / max(away, 1e-300))))
-        found = self.points.simulated([(theta, False) for theta in trials])
-        places = [(self.theta, self.long), *zip(trials, found, strict=True)]
-        before = float(((self.long + self._offset) ** 2).sum())
-        self.theta, self.long = min(places, key=lambda place: self._cost(fit, *place))
-        return before - float(((self.long + self._offset) ** 2).sum())
+            steps.append(step * min(1.0, REACHES / max(away, 1e-300)))
+        here, before = self._cost(fit, self.theta, self.long), float(((self.long + self._offset) ** 2).sum())
+        promised = here - min(self._cost(fit, self.points.moved(self.theta, s), self.long + fit.slopes @ s) for s in steps)
+        places = [(self.theta, self.long)]
+        for part in PARTS:
+            trials = [self.points.moved(self.theta, part * step) for step in steps]
+            places += zip(trials, self.points.simulated([(theta, False) for theta in trials]), strict=True)
+            theta, long = min(places, key=lambda place: self._cost(fit, *place))
+            if here - self._cost(fit, theta, long) > POOR * promised or promised < WORTH * len(theta):
+                break
+        self.theta, self.long = theta, long
+        return max(before - float(((long + self._offset) ** 2).sum()), POOR * promised)
 
     def _cost(self, fit: Regression, theta: FloatArray, long: FloatArray) -> float:
         return float(fit.weights @ (long + self._offset) ** 2 + (((theta - self.centre) / self.prior_sd) ** 2).sum())
