@@ -70,10 +70,10 @@ def test_a_part_that_swells_or_shrinks_is_seen_to(ratio: float) -> None:
 
 @pytest.mark.parametrize("ratio", [1.15, 0.85])
 def test_a_small_part_that_noise_hides_has_wide_regions(ratio: float) -> None:
-    """A gain that noise had lowered took from what shrinks and added to what swells: 17 % of the one were held, and 100 % of the other."""
+    """A gain that noise had lowered took from what shrinks: 17 % of it were held; regions alike along every axis held 80 % of a shift along one."""
     part = SwollenSphere(*SMALL, ratio)
     body, found = measured(SwollenSphere(*LARGE, ratio), part, noise=MUCH_NOISE)
-    assert held(body, found, near(body, part, 1.5)) > 0.75
+    assert held(body, found, near(body, part, 1.5)) > 0.9
     away = ~near(body, part, 2.0) & ~near(body, SwollenSphere(*LARGE, ratio), 1.5) & found.valid & body.mask
     sd = np.sqrt(np.trace(found.covariance_at(np.argwhere(away)[:, ::-1].astype(float)), axis1=1, axis2=2) / 3.0)
     assert np.median(sd) < 0.15  # voxels: what is hidden elsewhere is less
