@@ -6,11 +6,18 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
+from naibu.mechanics.contact.cut_lips import CutLips
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_strain.lip_assembly import with_lips
+from naibu.mechanics.finite_elements.hyperelasticity import small_strain_bulk_moduli, small_strain_shear_moduli
+from naibu.mechanics.finite_strain.lip_assembly import lips_of, with_lips
 from naibu.meshing.cutting.swept_blade import SweptBlade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.meshing.surface import boundary_faces
+
+STEPS = 0.02  # by which facets are larger than the cut that they follow, from which on they are steps
+YIELDING = 0.025  # of an edge of steps over the shear modulus: how they yield to a pressure between walls, from `benchmarks/cut_contact.py`
+MARGIN = 1.2  # on how the penalty yields, as the pressure rises smoothly over its ramp
+LEAST_SOFTER = 5.0  # % that are worth saying
 
 
 def with_sides_of_cuts(assembler: Assembler, mesh: Mesh, friction: float = 0.0, outward: FloatArray | None = None) -> Assembler:
@@ -69,3 +76,45 @@ def outward_normals(found: VolumeCut, blade: SweptBlade, before: FloatArray | No
     size = np.linalg.norm(pulled[now], axis=1)
     out[now] = pulled[now] / np.where(size > 0.0, size, 1.0)[:, None]
     return out
+
+
+def softer_behind_cuts(assembler: Assembler) -> float:
+    """Return by how much, %, a force may be too low that presses a cut body between walls, where it cannot give way sideways.
+
+    A body of thickness L and constrained modulus M then yields by ``L / M`` to a pressure, and the sides of a cut through it by ``1 / k``
+    of their penalty; where facets follow a blade in steps, also as these do not hand over the stress along the blade, which is as large
+    as that across it where the body is nearly incompressible.
+    """
+    found = 0.0
+    for lips in lips_of(assembler):
+        cells = np.isin(assembler.elements.connectivity, lips.pairs).any(axis=1)
+        chosen = np.unique(assembler.elements.cell_of_point[cells, 0])
+        shear = small_strain_shear_moduli(assembler.law_codes[chosen], assembler.parameters[chosen])
+        bulk = small_strain_bulk_moduli(assembler.law_codes[chosen], assembler.parameters[chosen])
+        facets, across = _facets(lips)
+        thickness = float((np.ptp(lips.points, axis=0) / np.maximum(np.abs(across), 1e-300)).min())  # of the box around the body
+        stepped = facets > (1.0 + STEPS) * lips.area.sum()
+        yielding = MARGIN / float(lips.stiffness.min()) + stepped * YIELDING * float(lips.edge.max()) / float(shear.min())
+        found = max(found, float((bulk + 4.0 / 3.0 * shear).max()) * yielding / thickness)
+    return 100.0 * found / (1.0 + found)
+
+
+def caution_of_cuts(assembler: Assembler, force: str) -> str:
+    """Return that a force may be too low behind the cuts of a body, and by how much; empty where that is not worth saying."""
+    softer = softer_behind_cuts(assembler)
+    if softer < LEAST_SOFTER:
+        return ""
+    return (
+        f"Behind the cut {force} may be up to {softer:.0f} % too low where walls keep the body from giving way sideways: it is nearly "
+        "incompressible there, and the sides of the cut yield."
+    )
+
+
+def _facets(lips: CutLips) -> tuple[float, FloatArray]:
+    """Return the area of the facets that pairs stand for, mm2, and the direction (3,) across the cut."""
+    first = lips.faces[: len(lips.faces) // 2]
+    a, b, c = lips.points[first].transpose(1, 0, 2)
+    vectors = 0.5 * np.cross(b - a, c - a)
+    shares = np.isin(first, lips.pairs).sum(axis=1) / 3.0  # corners at the front of a cut belong to no pair
+    mean = vectors.sum(axis=0)
+    return float(shares @ np.linalg.norm(vectors, axis=1)), mean / max(float(np.linalg.norm(mean)), 1e-300)

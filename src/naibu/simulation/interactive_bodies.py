@@ -30,7 +30,7 @@ from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.quality import mean_edge_length
 from naibu.meshing.refinement.forest import BisectionForest
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
-from naibu.simulation.cut_sides import outward_normals, with_sides_of_cuts
+from naibu.simulation.cut_sides import caution_of_cuts, outward_normals, with_sides_of_cuts
 from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
@@ -405,8 +405,11 @@ class FiniteElementBody:
         return session.unbalanced if isinstance(session, RealTimeSession) else 0.0
 
     def caution(self, name: str, tool: RigidIndenter) -> str:
-        """Return nothing: how wrong forces of tools smaller than elements are was not measured."""
-        return ""
+        """Return that behind cuts the force of a tool may be too low, and by how much; else nothing.
+
+        How wrong forces of tools smaller than elements are was not measured.
+        """
+        return caution_of_cuts(self.engine.assembler, f"the force of {name}")
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return the von Mises equivalent of the Green-Lagrange strain at the nodes (n,), %, averaged over the tetrahedra around them."""

@@ -23,7 +23,7 @@ from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import cut_volume
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_faces
-from naibu.simulation.cut_sides import outward_normals
+from naibu.simulation.cut_sides import outward_normals, softer_behind_cuts
 from naibu.simulation.interactive_bodies import FiniteElementBody
 
 SIZE = 20.0
@@ -251,3 +251,35 @@ def test_a_live_body_cut_and_pressed_carries_the_pressure():
     gaps = cut.engine.assembler.lips.gaps(u)
     assert forces[1] == pytest.approx(forces[0], rel=0.03) and forces[0] < -100.0
     assert gaps[np.isfinite(gaps)].min() > -0.02 * cut.engine.assembler.lips.edge.min()
+
+
+@pytest.mark.parametrize(("height", "tilt", "n"), [(0.6, 0.0, 5), (0.45, 4.0, 5)])
+@pytest.mark.parametrize("ratio", [0.3, 0.45, 0.49])
+def test_how_much_too_soft_a_body_between_walls_is_behind_a_cut_is_said(height, tilt, n, ratio):
+    """Between walls a nearly incompressible cut block is as stiff as the whole one; what is missing is within what is said, and not far."""
+    law, blade = material("neo_hookean", young_modulus=10.0, poisson_ratio=ratio), plane_blade(height * SIZE, tilt)
+    whole = box((SIZE,) * 3, (n, n, n), cell_type="tetra", centred=False)
+    plain = Assembler.from_materials(elements(whole, "mean_dilatation"), whole.regions, [law])
+    body, _, found = FiniteElementBody.of(whole, plain).cut(FiniteElementBody.of(whole, plain).engine.rest(), blade, SIZE / n)
+    places, number = np.unique(found.mesh.points, axis=0, return_inverse=True)
+    joined = Mesh.from_arrays(places, number.ravel()[found.mesh.cells], "tetra")
+    forces = []
+    for mesh, assembler in (
+        (joined, Assembler.from_materials(elements(joined, "mean_dilatation"), joined.regions, [law])),
+        (found.mesh, body.engine.assembler),
+    ):
+        top = mesh.points[:, 2] > SIZE - 1e-9
+        walls = (mesh.points < 1e-9) | (mesh.points > SIZE - 1e-9) | top[:, None]
+        held = PrescribedDisplacement(walls, np.where(top[:, None], [0.0, 0.0, -0.2], 0.0))
+        task = Problem(mesh.points, assembler, (), held, np.zeros_like(mesh.points))
+        u = solve(task, settings=SolverSettings(tolerance=1e-8)).displacement
+        forces.append(assembler.forces(u)[1][top, 2].sum())
+    softer, said = 100.0 * (1.0 - forces[1] / forces[0]), softer_behind_cuts(body.engine.assembler)
+    tool = plane_indenter((0.0, 0.0, 2.0 * SIZE), (0.0, 0.0, -1.0))
+    if (
+        ratio > 0.4
+    ):  # of smaller ratios the stresses along the cut and across it differ, and sides that slide relieve shear as they ought to
+        assert 0.5 * said < softer < said
+    assert ("too low where walls keep" in body.caution("the plate", tool)) == (said >= 5.0)
+    assert (said >= 5.0) == (ratio == 0.49 or (ratio == 0.45 and tilt > 0.0))
+    assert softer_behind_cuts(plain) == 0.0 and FiniteElementBody.of(whole, plain).caution("the plate", tool) == ""

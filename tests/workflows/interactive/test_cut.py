@@ -16,7 +16,7 @@ from naibu.io.images import write_volume
 from naibu.io.meshes import read_mesh
 from naibu.io.vtk_files import write_vtu
 from naibu.meshing import VolumeCut, box, signed_volumes
-from naibu.workflows import cut
+from naibu.workflows import MeshMaterial, cut
 from naibu.workflows.interactive.cut import joined_text
 
 SIZE = 20.0
@@ -54,6 +54,15 @@ def test_a_whole_cut_parts_the_pieces_by_the_pull(tmp_path: Path) -> None:
     assert len(done.volumes_mm3) == 2
     assert done.opening_mm == pytest.approx(2.0, rel=0.05)
     assert sum(float(str(row["volume_mm3"])) for row in check_shown(done, done.files[0])) == pytest.approx(SIZE**3)
+
+
+def test_a_gel_whose_forces_may_be_too_low_behind_the_cut_says_so(tmp_path: Path) -> None:
+    body, path = mesh_file(tmp_path), path_file(tmp_path, -5.0)
+    cut(body, path, out=tmp_path / "gel", pull_percent=0.0, material=MeshMaterial(poisson_ratio=0.495))
+    said = json.loads((tmp_path / "gel" / "cut.json").read_text())["caution"]
+    assert said.startswith("Behind the cut a force on the body may be up to") and said in (tmp_path / "gel" / "cut.html").read_text()
+    cut(body, path, out=tmp_path / "soft", pull_percent=0.0, material=MeshMaterial(poisson_ratio=0.3))
+    assert "caution" not in json.loads((tmp_path / "soft" / "cut.json").read_text())
 
 
 def test_friction_does_not_hold_what_opens_and_is_refused_where_there_is_none(tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.meshing.cutting.swept_blade import SweptBlade, swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.meshing.quality import mean_edge_length, signed_volumes
+from naibu.simulation.cut_sides import caution_of_cuts
 from naibu.simulation.interactive_bodies import AnySession, FiniteElementBody, InteractiveBody, LatticeBody
 from naibu.simulation.lattice_cut import LatticeCut
 from naibu.viewer.cards import Card
@@ -152,7 +153,7 @@ def cut(
             **({} if distance is None else {"allowed_distance_mm": 0.5 * distance}), "largest_opening_mm": opening,
             "source": str(source), "naibu": __version__, "pull_percent": pull_percent,
             **({"lips_friction": lips_friction} if lips_friction else {}),
-            **({"doubt": model.doubt} if model.doubt else {}),
+            **({"doubt": model.doubt} if model.doubt else {}), **({"caution": caution} if (caution := _caution(after)) else {}),
             "pulled_along": "xyz"[int(np.abs(turn[:, axis]).argmax())], "inputs_sha256": {Path(path).name: sha256(path)},
         }  # fmt: skip
         files = _written(folder, model, after.faces, found, numbers, times, moved)
@@ -182,6 +183,11 @@ def _cut(
     distance = 0.5 * mean_edge_length(body.mesh) if distance_mm is None else distance_mm
     behind, _, cut_mesh = body.cut(body.engine.rest(), blade, distance)
     return body.mesh, behind, cut_mesh, distance
+
+
+def _caution(body: InteractiveBody) -> str:
+    """What is to be said of forces on the body behind the cut; empty where nothing is."""
+    return caution_of_cuts(body.engine.assembler, "a force on the body") if isinstance(body, FiniteElementBody) else ""
 
 
 def _rubbing(body: InteractiveBody, friction: float) -> InteractiveBody:
@@ -314,6 +320,7 @@ def _page(
         *([earlier] if (earlier := joined_text(found)) else []),
         model.sentences[0],
         *([f"Its sides rub on each other with a friction coefficient of {friction:g}."] if friction else []),
+        *([caution] if (caution := numbers.get("caution")) else []),
         *([model.doubt] if model.doubt else []),
     )
     rows = [(quantity_of(name), value) for name, value in numbers.items() if isinstance(value, int | float)]
