@@ -167,7 +167,8 @@ def cut(
     wrote(*done.files)
     sizes = ", ".join(f"{volume:.0f}" if volume > 1e3 else f"{volume:.4g}" for volume in done.volumes_mm3[:6])
     say(
-        f"{done.cut.n_pieces} piece{'s' * (done.cut.n_pieces > 1)} of {sizes} mm3; the cut deviates from the blade by {length_text(done.cut.deviation_mm)} at most."
+        f"{done.cut.n_pieces} piece{'s' * (done.cut.n_pieces > 1)} of {sizes} mm3; the cut deviates from the blade by "
+        f"{length_text(done.cut.deviation_mm)} at most."
     )
     if earlier := joined_text(done.cut):
         say(earlier)

@@ -75,10 +75,11 @@ def read_number_rows(path: str | os.PathLike[str]) -> FloatArray:
     rows: list[list[float]] = []
     separator = _separator(text)
     try:
-        for line, cells in enumerate(csv.reader(StringIO(text), delimiter=separator), start=1):
+        for line, written in enumerate(csv.reader(StringIO(text), delimiter=separator), start=1):
+            cells = written if separator == "," else [cell.replace(",", ".") for cell in written]
             if not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#") or (not rows and _names(cells)):
                 continue
-            rows.append([_number(file, line, cell if separator == "," else cell.replace(",", ".")) for cell in cells])
+            rows.append([_number(file, line, cell) for cell in cells])
             if len(rows[-1]) != len(rows[0]):
                 raise InputError(f"{file}: row {line} has {len(rows[-1])} numbers, the first has {len(rows[0])}; give each row the same")
             if len(rows) > MOST_ROWS:
