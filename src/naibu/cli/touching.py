@@ -165,8 +165,11 @@ def cut(
             **({} if lips_friction is None else {"lips_friction": lips_friction}),
         )  # fmt: skip
     wrote(*done.files)
-    sizes = ", ".join(f"{volume:.4g}" for volume in done.volumes_mm3[:6])
-    say(f"{done.cut.n_pieces} piece(s) of {sizes} mm3; the cut deviates from the blade by {length_text(done.cut.deviation_mm)} at most.")
+    sizes = ", ".join(f"{volume:.0f}" if volume > 1e3 else f"{volume:.4g}" for volume in done.volumes_mm3[:6])
+    say(
+        f"{done.cut.n_pieces} piece{'s' * (done.cut.n_pieces > 1)} of {sizes} mm3; the cut deviates from the blade by "
+        f"{length_text(done.cut.deviation_mm)} at most."
+    )
     if earlier := joined_text(done.cut):
         say(earlier)
     say(f"Page: {done.files[0]}   {', '.join(str(file) for file in done.files[1:])}")
@@ -181,7 +184,7 @@ def _cut_surface(source: str, path: Path, out: Path, distance_mm: float | None, 
         done = run(source, path, out=out, distance_mm=distance_mm, overwrite=overwrite, progress=progress, **stated)
     wrote(*done.files)
     say(
-        f"{done.cut.n_pieces} piece(s) of {areas_text(done.cut)} mm2; the cut deviates from the path by "
+        f"{done.cut.n_pieces} piece{'s' * (done.cut.n_pieces > 1)} of {areas_text(done.cut)} mm2; the cut deviates from the path by "
         f"{length_text(done.cut.deviation_mm)} at most, {length_text(done.cut.mean_deviation_mm)} on average."
     )
     for repair in done.cut.repairs:

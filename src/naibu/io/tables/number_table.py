@@ -19,7 +19,7 @@ MOST_ROWS = 100_000
 
 
 def read_numbers(path: str | os.PathLike[str], columns: Sequence[str], *, units: Sequence[str] | None = None) -> FloatArray:
-    """Read a table of comma-separated numbers with given columns.
+    """Read a table of numbers with given columns.
 
     Parameters
     ----------
@@ -54,7 +54,8 @@ def read_number_rows(path: str | os.PathLike[str]) -> FloatArray:
     Parameters
     ----------
     path : path-like
-        Comma-separated; rows that begin with ``#``, and a first row of names, are passed over.
+        Separated by commas, or by semicolons or tabs with a decimal comma or point; rows that begin with ``#``, and a first row of names,
+        are passed over.
 
     Returns
     -------
@@ -72,8 +73,10 @@ def read_number_rows(path: str | os.PathLike[str]) -> FloatArray:
     except UnicodeDecodeError as error:
         raise InputError(f"{file}: is not UTF-8 text ({error.reason} at byte {error.start}); save the table as CSV in UTF-8") from error
     rows: list[list[float]] = []
+    separator = _separator(text)
     try:
-        for line, cells in enumerate(csv.reader(StringIO(text)), start=1):
+        for line, written in enumerate(csv.reader(StringIO(text), delimiter=separator), start=1):
+            cells = written if separator == "," else [cell.replace(",", ".") for cell in written]
             if not any(cell.strip() for cell in cells) or cells[0].lstrip().startswith("#") or (not rows and _names(cells)):
                 continue
             rows.append([_number(file, line, cell) for cell in cells])
@@ -87,12 +90,19 @@ def read_number_rows(path: str | os.PathLike[str]) -> FloatArray:
 
 
 def _require_units(file: Path, units: Sequence[str]) -> None:
-    names = next(csv.reader(StringIO(read_bytes(file).decode("utf-8-sig"))), [])
+    text = read_bytes(file).decode("utf-8-sig")
+    names = next(csv.reader(StringIO(text), delimiter=_separator(text)), [])
     for name, unit in zip(names, units, strict=False):
         others = "|min|h" if unit == "s" else ""
         told = re.search(rf"(?:^|[_\W])([a-zA-Zµμ]?{re.escape(unit)}{others})\W*$", name)
         if told is not None and told[1] != unit:
             raise InputError(f"{file}: column {name.strip()[:40]!r} is in {told[1]}; convert it to {unit}, and name it so")
+
+
+def _separator(text: str) -> str:
+    """What separates the cells of a table: a tab or semicolon where its first row has one, as spreadsheets write beside decimal commas."""
+    first = next((line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")), "")
+    return next((mark for mark in "\t;" if mark in first), ",")
 
 
 def _names(cells: list[str]) -> bool:

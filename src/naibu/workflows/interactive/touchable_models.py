@@ -170,6 +170,11 @@ def touchable(source: str | os.PathLike[str], *, experiment: Source | None = Non
         return _meshed(path, read_mesh(path), material or MeshMaterial())
     if str(source) in NAMED or path.suffix == ".toml":
         return _lattice(prepared_study(source))
+    if path.is_file():
+        raise InputError(
+            f"{source}: files ending in {path.suffix!r} are not read; save a mesh as {' or '.join(MESH_READERS)} (ParaView and meshio do), "
+            f"or give a {MODEL_FILE} or a study (.toml)"
+        )
     raise InputError(
         f"{source}: is neither a {MODEL_FILE} or its folder, nor a mesh ({', '.join(MESH_READERS)}), nor a study (.toml); what naibu "
         f"brings with it is demo (the gels of naibu demo) and the lattices {', '.join(NAMED)}"
