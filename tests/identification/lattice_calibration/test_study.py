@@ -239,6 +239,9 @@ def test_values_of_another_search_get_intervals_of_regressions_in_contact(pushed
     assert found.settled
     assert low < MU < high and high - low < 0.05
     assert not found.determined()[problem.unknowns.names.index("static friction of floor")]
+    interrupted = estimate_at(problem, searched.values, finished=False)
+    assert interrupted.runs == 1 and not interrupted.finished
+    assert not interrupted.determined().any()
 
 
 def test_masses_of_the_surface_keep_the_total() -> None:

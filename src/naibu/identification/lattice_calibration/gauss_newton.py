@@ -332,7 +332,7 @@ def estimate_at(
     """Return values that were found by another search as an estimate, with the intervals that derivatives give there.
 
     Intervals reach to where derivatives say that the minimum is. In contact derivatives count jumps as information: there regressions
-    around these values, as those of `calibrate_lattice`, give the estimate and its intervals.
+    around these values, as those of `calibrate_lattice`, give the estimate and its intervals, unless the search was interrupted.
 
     Parameters
     ----------
@@ -354,7 +354,12 @@ def estimate_at(
     """
     theta = np.log(problem.unknowns.vector(values))
     if problem.shifts(np.exp(theta)) is not None:
-        return replace(_searched_in_contact(problem, theta, theta, prior_sd, 0, Evaluations(threads, None, None)), finished=finished)
+        at = Evaluations(threads, None, None)
+        if not finished:
+            point = at(problem, theta, derivatives=False, fine=True)
+            slopes = (np.zeros((len(point.residual[0]), len(theta))), np.zeros((len(point.residual[1]), len(theta))))
+            return _interrupted(problem, replace(point, slopes=slopes), theta, prior_sd, at)
+        return _searched_in_contact(problem, theta, theta, prior_sd, 0, at)
     factors = noise_factors(problem, evaluated(problem, theta, derivatives=False, fine=True).residual)
     here = problem.enlarged((max(factors[0], 1.0), max(factors[1], 1.0)))
     residual = evaluated(here, theta, derivatives=False, fine=True).residual
