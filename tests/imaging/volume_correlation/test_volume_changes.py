@@ -70,7 +70,7 @@ def test_a_part_that_swells_or_shrinks_is_seen_to(ratio: float) -> None:
 
 @pytest.mark.parametrize("ratio", [1.15, 0.85])
 def test_a_small_part_that_noise_hides_has_wide_regions(ratio: float) -> None:
-    """A gain that noise had lowered took from what shrinks: 17 % of it were held; regions alike along every axis held 80 % of a shift along one."""
+    """A gain that noise had lowered took from what shrinks (17 % held), and a variance that was right for no line held 80 %."""
     part = SwollenSphere(*SMALL, ratio)
     body, found = measured(SwollenSphere(*LARGE, ratio), part, noise=MUCH_NOISE)
     assert held(body, found, near(body, part, 1.5)) > 0.9

@@ -28,8 +28,8 @@ SHIFTS = 1.22074408460575947536 ** -np.arange(1.0, 4.0)
 SPREAD = 0.7  # cells: SD of the window in which cells share what is hidden
 REACH = 1.2 * RADIUS  # cells: within which the displacement is lost
 MOST_EVIDENCE = 15.0  # logarithm of how much more probable a part at one place is than at another, beyond which it does not matter
-# variance along every axis, in squares of a displacement along one line of unknown direction, whose 95 % region holds 95 % of such: quantiles
-# of chi-squared of one and three degrees of freedom. Its mean square along every axis, a third, would hold 89 %
+# variance along every axis, in squares of a displacement along one line of unknown direction, whose 95 % region holds 95 % of such:
+# quantiles of chi-squared of one and of three degrees of freedom. With its mean square along an axis, a third, 89 % would be held
 ONE_LINE = 3.841 / 7.815
 RESPONSE_TOLERANCE = 0.01  # of the linear solves: conjugate gradients find the smooth part, in which the parts of a lattice differ, last
 
