@@ -33,7 +33,7 @@ def design(
 ) -> None:
     """Plan an experiment: how well moduli will be known, by push, number of measured points or markers, and noise.
 
-    Every push, number of points and noise is tried with each other, and all pushes together. Nothing is measured: the displacement is
+    Every combination of push, number of points and noise is tried, and all pushes together. Nothing is measured: the displacement is
     simulated with the moduli that are expected, and identified with the noise to come.
 
     Parameters

@@ -328,7 +328,7 @@ def import_tables(
     Parameters
     ----------
     initial
-        Table of the unloaded state, with columns for label, x, y and z.
+        Table of the unloaded state, with columns for the number of a marker, x, y and z.
     loaded
         Tables of the loaded states, which are named after their files.
     size_mm
@@ -336,7 +336,7 @@ def import_tables(
     title
         Title of the experiment.
     unit
-        Unit of the coordinates, if the column names do not state it.
+        Unit of the coordinates (mm, cm, m, um or inch), if the column names do not state it; else mm.
     spacing_mm
         Spacing of a regular marker lattice.
     xy_step_mm

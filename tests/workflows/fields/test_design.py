@@ -115,6 +115,21 @@ def test_the_command_line_and_what_it_refuses(
     assert f"to {expected:.2g} % (standard deviation {row['SD, %']:.2g} %, systematic error" in page
 
 
+def test_a_push_that_shows_nothing_is_no_best_one(tmp_path: Path) -> None:
+    """A push of 4 um, as of one that was given in metres, beside noise of 40 um."""
+    plan = design(
+        size_mm=SIZE, layers=LAYERS, **MATERIALS, pushes=["z+=0,0,-0.004"], points=[100], noise_mm=[SD_MM], law="linear",
+        element_size_mm=EDGE_MM, out=tmp_path / "plan",
+    )  # fmt: skip
+    assert plan.notes[0].startswith("None of these pushes determines the modulus of gel") and "Best" not in "".join(plan.notes)
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(f"{constant} is no JSON")
+
+    stored = json.loads((tmp_path / "plan" / "design.json").read_text(encoding="utf-8"), parse_constant=refuse)
+    assert stored["rows"][0]["to, kPa"] is None
+
+
 def test_what_is_missing_or_wrong_is_told() -> None:
     good = {"size_mm": SIZE, "layers": LAYERS, **MATERIALS, "pushes": ["z+=0,0,-1"]}
     for change, message in (

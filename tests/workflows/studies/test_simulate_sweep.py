@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from functools import partial
 from pathlib import Path
 
@@ -99,6 +100,10 @@ def test_a_run_that_cannot_be_computed_is_a_row_that_says_why(tmp_path: Path) ->
     rows = json.loads((tmp_path / "out" / "varied.json").read_text(encoding="utf-8"))["rows"]
     assert [bool(row["problem"]) for row in rows] == [False, True, False, True]
     assert "centre_mm" in rows[1]["problem"] and rows[1]["figures"]["largest displacement, mm"] is None
+    page = (tmp_path / "out" / "varied.html").read_text(encoding="utf-8")
+    assert page.count("begins inside the object") == 1  # one reason, with the runs that have it
+    assert re.search(r"Runs that could not be computed.*2, 4.*begins inside", page, re.DOTALL)
+    assert "parameters.\u200bK, mN/mm" in page
 
 
 @pytest.mark.parametrize("times", [1, 99])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import Parameter, Token
 
+from naibu.cli.shell.help_texts import flowing
 from naibu.core.errors import InputError
 
 # what needs numpy is imported where it is used: --help answers at once, and doctor also runs where numpy itself is broken
@@ -36,6 +37,7 @@ Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 @Parameter(name="*")
+@flowing
 @dataclass(frozen=True)
 class PairOptions:
     """Options for a pair of scans.
@@ -73,6 +75,7 @@ class PairOptions:
 
 
 @Parameter(name="*")
+@flowing
 @dataclass(frozen=True)
 class WorkerOptions:
     """Where independent parts of a computation run.
@@ -95,6 +98,7 @@ class WorkerOptions:
 
 
 @Parameter(name="*")
+@flowing
 @dataclass(frozen=True)
 class ObjectOptions:
     """Shape, layers and loading of an object.

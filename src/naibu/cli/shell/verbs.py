@@ -8,6 +8,7 @@ from typing import Any
 from cyclopts import Group
 
 from naibu.cli.shell.console import app
+from naibu.cli.shell.help_texts import flowing
 
 START = Group("Start", sort_key=1)
 MARKERS = Group("Markers: from positions to a calibrated model", sort_key=2)
@@ -32,7 +33,7 @@ def verb(group: Group, *examples: str, name: str | None = None) -> Callable[[Cal
     lines = "\n".join(_shown(example) for example in examples)
 
     def registered(function: Callable[..., Any]) -> Callable[..., Any]:
-        app.command(function, name=name, group=group, help_epilogue=f"Examples:\n\n{lines}" if examples else "")
+        app.command(flowing(function), name=name, group=group, help_epilogue=f"Examples:\n\n{lines}" if examples else "")
         return function
 
     return registered

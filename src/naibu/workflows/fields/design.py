@@ -25,8 +25,10 @@ from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.identified.sides import SIDES
 from naibu.identification.from_fields.planned_identification import planned_identification
+from naibu.identification.verdict import UNDETERMINED
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
+from naibu.viewer.json_values import jsonable
 from naibu.viewer.page_frame import page_html
 from naibu.viewer.tables import Cell, Table, table_html
 from naibu.workflows.fields.block_mesh import CELLS, block_mesh, labelled_object, names_of_labels, sizes_of_voxels
@@ -40,8 +42,8 @@ LEAST_POINTS, MOST_POINTS = 30, 200_000
 MOST_PLANS = 60
 ALL = "all of them together"
 COLUMNS = (
-    "push", "points", "noise, mm", "zone", "Young's modulus, kPa", "SD, %", "of it from noise, %", "95 % from", "to",
-    "systematic error, %", "Poisson's ratio", "SD of it",
+    "push", "points", "noise, mm", "zone", "Young's modulus, kPa", "SD, %", "SD from noise, %", "95 % from, kPa", "to, kPa",
+    "systematic error, %", "Poisson's ratio", "SD of Poisson's ratio",
 )  # fmt: skip
 
 
@@ -296,10 +298,16 @@ def _notes(rows: Sequence[Planned], plates_only: bool) -> tuple[str, ...]:
         if key not in worst or row.error > worst[key].error:
             worst[key] = row
     best = min(worst.values(), key=lambda row: row.error)
-    lines = [
-        f"Best: {best.push}, {best.points} points, noise {best.noise_mm:g} mm: the least known modulus, that of {best.zone}, to "
-        f"{100 * best.error:.2g} % (standard deviation {100 * best.young_modulus_sd:.2g} %, systematic error {100 * best.bias:+.2g} %)."
-    ]
+    if 1.96 * best.young_modulus_sd > math.log(UNDETERMINED):
+        lines = [
+            f"None of these pushes determines the modulus of {best.zone} to within a factor of {UNDETERMINED:g}: push farther, or measure "
+            "more points, or with less noise. Are all lengths in mm?"
+        ]
+    else:
+        lines = [
+            f"Best: {best.push}, {best.points} points, noise {best.noise_mm:g} mm: the least known modulus, that of {best.zone}, to "
+            f"{100 * best.error:.2g} % (standard deviation {100 * best.young_modulus_sd:.2g} %, systematic error {100 * best.bias:+.2g} %)."
+        ]
     if best.young_modulus_sd > 0.0 and best.noise_sd < 0.5 * best.young_modulus_sd:
         lines.append("There, elements and what is not known of known zones weigh more than noise: more points will help little.")
     touched = "Nothing but the plates touches the object, and the identification is told so (naibu identify --loaded)."
@@ -322,7 +330,7 @@ def _written(folder: Path, result: Design, provenance: Mapping[str, object]) -> 
     table = result.table()
     rows = [dict(zip(COLUMNS, row, strict=True)) for row in table.rows]
     numbers = {"naibu": __version__, "rows": rows, "in_words": list(result.notes), **provenance}
-    text = json.dumps(numbers, indent=1, ensure_ascii=False) + "\n"
+    text = json.dumps(jsonable(numbers, 17), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
     lead = "".join(f"<p{' class=lead' if i == 0 else ''}>{escape(s)}</p>" for i, s in enumerate(result.notes))
     page = page_html("Planned experiment", lead, table_html(table), f"naibu {escape(__version__)}")
     return [write_atomically(folder / "design.html", page), write_atomically(folder / "design.json", text)]

@@ -72,7 +72,7 @@ def sweep_html(title: str, rows: SweepRows, total: int, settings: dict[str, Any]
         Contents of the sweep's file.
     """
     varied = [k for k in range(len(rows.quantities)) if _varies(rows.figures[rows.computed, k])]
-    sections = [Section("Runs", tuple(_sentences(rows, total)), (_table(rows),))]
+    sections = [Section("Runs", tuple(_sentences(rows, total)), (_table(rows), *_problems(rows)))]
     if rows.computed.sum() >= LEAST_RUNS and varied:
         sections.insert(0, Section("What depends on what", (_HOW,), (_correlations(rows, varied),), tuple(_figures(rows, varied))))
     elif rows.computed.any() and varied:
@@ -91,7 +91,7 @@ def _sentences(rows: SweepRows, total: int) -> list[str]:
     failed = int((~rows.computed).sum())
     told = [f"{len(rows.numbers)} of {total} runs are finished."] if len(rows.numbers) < total else [f"{total} runs."]
     if failed:
-        told.append(f"{failed} of them could not be computed; the last column says why.")
+        told.append(f"{failed} of them could not be computed; the second table says why.")
     still = [name for k, name in enumerate(rows.quantities) if rows.computed.any() and not _varies(rows.figures[rows.computed, k])]
     if still and len(rows.numbers) > 1:
         told.append(f"The same in all runs: {'; '.join(still)}.")
@@ -105,12 +105,34 @@ def _varies(values: FloatArray) -> bool:
 
 
 def _table(rows: SweepRows) -> Table:
-    problem = ("problem",) if any(rows.problems) else ()
     cells: list[tuple[Cell, ...]] = []
     for k, number in enumerate(rows.numbers[:SHOWN_ROWS]):
-        last = (rows.problems[k],) if problem else ()
-        cells.append((number, *(float(f"{v:.4g}") for v in rows.values[k]), *(float(f"{v:.4g}") for v in rows.figures[k]), *last))
-    return Table("Runs", ("run", *rows.keys, *rows.quantities, *problem), tuple(cells))
+        cells.append((number, *(float(f"{v:.4g}") for v in rows.values[k]), *(float(f"{v:.4g}") for v in rows.figures[k])))
+    return Table("Runs", ("run", *map(_broken, rows.keys), *rows.quantities), tuple(cells))
+
+
+def _problems(rows: SweepRows) -> tuple[Table, ...]:
+    """Return a table of why runs could not be computed, with the runs of each reason; none where all were."""
+    runs: dict[str, list[str]] = {}
+    for number, why in zip(rows.numbers, rows.problems, strict=True):
+        if why:
+            runs.setdefault(why, []).append(str(number))
+    if not runs:
+        return ()
+    cells = tuple((", ".join(numbers), why) for why, numbers in list(runs.items())[:SHOWN_ROWS])
+    return (Table("Runs that could not be computed", ("run", "why"), cells),)
+
+
+def _labelled(key: str) -> str:
+    """Return the name of a parameter with its unit, which those of springs and dashpots do not hold."""
+    table, _, name = key.partition(".")
+    unit = {"K": ", mN/mm", "C": ", mN s/mm"}.get(name[:1], "") if table == "parameters" else ""
+    return f"{key}{unit}"
+
+
+def _broken(key: str) -> str:
+    """Return a name with its unit whose line may break behind its dots."""
+    return _labelled(key).replace(".", ".\u200b")
 
 
 def _correlations(rows: SweepRows, varied: list[int]) -> Table:
@@ -120,7 +142,10 @@ def _correlations(rows: SweepRows, varied: list[int]) -> Table:
         found = [spearmanr(rows.values[rows.computed, p], figures).statistic for p in range(len(rows.keys))]
         lines.append((rows.quantities[k], *(round(float(r), 2) for r in found)))
     return Table(
-        "Rank correlation", ("figure", *rows.keys), tuple(lines), note="Spearman's rank correlation; it tells of monotonic dependence only."
+        "Rank correlation",
+        ("figure", *map(_broken, rows.keys)),
+        tuple(lines),
+        note="Spearman's rank correlation; it tells of monotonic dependence only.",
     )
 
 
@@ -139,7 +164,7 @@ def _drawn(rows: SweepRows, quantity: int) -> Callable[[Canvas], None]:
         for p, key in enumerate(rows.keys):
             axes = canvas.add_subplot(down, across, p + 1)
             axes.plot(rows.values[rows.computed, p], rows.figures[rows.computed, quantity], "o", markersize=4, alpha=0.7)
-            axes.set_xlabel(key)
+            axes.set_xlabel(_labelled(key))
             if p % across == 0:
                 axes.set_ylabel(textwrap.fill(rows.quantities[quantity], LABEL))
 
