@@ -171,8 +171,8 @@ def test_plane_borders_may_lie_anywhere_within_a_voxel(folder: Path) -> None:
         found.append(run.estimate)
     half = next(a for a in found[1].assumptions if "border" in a.text)
     assert half.text == "with the border of 'gel' and 'pad' half a voxel (1 mm) further along z of the grid"
-    assert all(e.mesh_shift is not None and e.prior_bias is not None for e in found)
-    below, _, above = (float((e.theta - e.mesh_shift + e.prior_bias)[0]) for e in found)  # that fit best
+    assert all(e.mesh_shift is not None and e.surface_bias is not None for e in found)
+    below, _, above = (float((e.theta - e.mesh_shift + e.surface_bias)[0]) for e in found)  # that fit best
     assert half.theta[0] == pytest.approx((above - below) / 4.0, rel=0.2)
     assert found[1].budget is not None
     assert found[1].budget.known[0] == pytest.approx(abs(half.theta[0]) / np.sqrt(3.0), rel=1e-6)

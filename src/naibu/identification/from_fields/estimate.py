@@ -59,7 +59,6 @@ from naibu.identification.from_fields.mesh_error import (
     relative_change,
     stretch_of,
 )
-from naibu.identification.from_fields.prior_bias import bias_of_prior
 from naibu.identification.from_fields.regions.border_refinement import (
     MOST_REGIONS,
     CorrectedRegions,
@@ -69,6 +68,7 @@ from naibu.identification.from_fields.regions.border_refinement import (
 )
 from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
 from naibu.identification.from_fields.statement import statement
+from naibu.identification.from_fields.surface_bias import bias_of_surface
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
 from naibu.identification.from_fields.verdict import inflation, verdict
 from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
@@ -396,7 +396,7 @@ class _Recipe:
                 covariance, coarse = corrected.doubt, not corrected.converged
             covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
             of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
-        best, (bias, left) = theta, bias_of_prior(at, quadratic)
+        best, (bias, left) = theta, bias_of_surface(at, quadratic, point.misfit / freedom if freedom > 0.0 else 1.0)
         total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]

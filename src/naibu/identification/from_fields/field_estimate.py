@@ -65,8 +65,8 @@ class FieldEstimate:
         Borders of regions that were found, which run through cells; None where regions are made of whole cells.
     parts : ndarray, shape (m, count), or None
         With such borders: part of every cell in each region, by which logarithms of moduli are mixed.
-    prior_bias : ndarray, shape (2 count,), or None
-        What the weak prior on the motion of the surface had added to theta, and was taken off (see `bias_of_prior`).
+    surface_bias : ndarray, shape (2 count,), or None
+        What the motion of the surface, its weak prior and the noise had added to theta, and was taken off (see `bias_of_surface`).
     """
 
     mesh: Mesh
@@ -89,7 +89,7 @@ class FieldEstimate:
     assumptions: tuple[Assumption, ...] = ()
     borders: Borders | None = None
     parts: FloatArray | None = None
-    prior_bias: FloatArray | None = None
+    surface_bias: FloatArray | None = None
 
     @property
     def young_modulus(self) -> FloatArray:
