@@ -185,8 +185,7 @@ class _Recipe:
         if given is not None:
             return first_point(self.model, objective.clipped(logarithms(*(np.asarray(g, dtype=float) for g in given))))
         zones = self.model.zones
-        one = replace(zones, of_cell=np.where(zones.of_cell == KNOWN, KNOWN, 0), names=("body",))
-        homogeneous = self._plain().with_zones(one)
+        homogeneous = self._plain().with_zones(zones.of_one_material())
         known = zones.known_mu[zones.of_cell == KNOWN]
         shear = float(np.exp(np.log(known).mean())) if len(known) else 1.0
         ratio = 2.0 * (1.0 + START_POISSON_RATIO) / (3.0 * (1.0 - 2.0 * START_POISSON_RATIO))
@@ -261,9 +260,16 @@ class _Recipe:
             )
             return done
 
+        def uniform() -> WeightTrial:
+            one = self.model.with_zones(self.model.zones.of_one_material())
+            start = one.evaluate(point.theta.reshape(2, -1).mean(axis=1), point.states)
+            found = search(one, start, Objective(bounds=self.bounds), SEARCH_AT_WEIGHT)
+            everywhere = self.model.evaluate(np.repeat(found.point.theta, self.model.zones.count), found.point.states)
+            return WeightTrial(max(first, 2.0 * weight_of_borders(graph)), replace(found, point=everywhere), everywhere.misfit, 0.0)
+
         # a jump of 1 across the body would cost as much as a sixth of what the homogeneous body leaves unexplained
         first = 0.5 * point.misfit / (6.0 * float(graph.volume.sum()) ** ((self.model.mesh.dimension - 1) / self.model.mesh.dimension))
-        choice = choose_weight(solve, first, self.model.n_free, rule)
+        choice = choose_weight(solve, first, self.model.n_free, rule, uniform)
         self.record(choice.reason)
         return choice
 

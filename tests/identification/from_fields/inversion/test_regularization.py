@@ -128,6 +128,16 @@ def test_where_the_noise_is_out_of_reach_the_corner_is_taken_and_told() -> None:
     assert choice.taken.weight < 10.0
 
 
+def test_where_no_jump_is_needed_no_weight_is_tried() -> None:
+    """A misfit that falls below that of noise without a jump does so at every weight: the greatest is infinite."""
+    tried: list[float] = []
+    solve = solver_of(lambda w: 100.0 * w / (1.0 + w), lambda w: 1.0 / w, [])
+    choice = choose_weight(solver_of(lambda w: 100.0, lambda w: 1.0 / w, tried), 1.0, 120.0, "discrepancy", lambda: solve(7.0, None))
+    assert tried == [] and choice.met and choice.taken.weight == 7.0 and "87.5 against 120" in choice.reason
+    choose_weight(solver_of(lambda w: 40.0 + 50.0 * w, lambda w: 1.0 / w, tried), 1.0, 60.0, "discrepancy", lambda: solve(7.0, None))
+    assert tried  # 87.5 is more than noise of 60
+
+
 def test_corner_of_a_right_angle() -> None:
     weights = [FACTOR**-k for k in range(7)]
     values = [(1000.0, 1.0), (300.0, 1.05), (100.0, 1.1), (95.0, 1.2), (93.0, 10.0), (92.0, 100.0), (91.0, 1000.0)]

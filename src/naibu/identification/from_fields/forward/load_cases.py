@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -178,6 +178,10 @@ class Zones:
         if not names:
             raise InputError("every region is known: leave out of `known` what is to be identified")
         return cls(of_cell, tuple(names), lame, shear, tuple(regions), region_of_cell)
+
+    def of_one_material(self) -> Zones:
+        """Return the zones with all that is not known as one of them."""
+        return replace(self, of_cell=np.where(self.of_cell == KNOWN, KNOWN, 0), names=("body",))
 
     @property
     def count(self) -> int:

@@ -78,7 +78,9 @@ class WeightChoice:
 Solve = Callable[[float, Found | None], WeightTrial]
 
 
-def choose_weight(solve: Solve, first: float, target: float, rule: WeightRule | float) -> WeightChoice:
+def choose_weight(
+    solve: Solve, first: float, target: float, rule: WeightRule | float, uniform: Callable[[], WeightTrial] | None = None
+) -> WeightChoice:
     """Try weights and take one.
 
     Parameters
@@ -91,6 +93,9 @@ def choose_weight(solve: Solve, first: float, target: float, rule: WeightRule | 
         Misfit that noise alone leaves: the number of measurements less that of nuisances.
     rule : {"discrepancy", "l_curve"} or float
         The greatest weight whose misfit is not above `SLACK` times the target, else the corner of the L-curve; the corner; or a weight.
+    uniform : callable, optional
+        Finds the best field without any jump, that of an infinite weight. Where it leaves no more than noise would, no weight is too
+        great, and it is taken: at great weights a search advances so little at a time that it took hours to come near.
 
     Raises
     ------
@@ -102,6 +107,10 @@ def choose_weight(solve: Solve, first: float, target: float, rule: WeightRule | 
             raise InputError(f"the weight of a penalty must be positive, not {rule:g}")
         return WeightChoice((solve(float(rule), None),), 0, target, f"weight {rule:g} as given")
     if rule == "discrepancy":
+        without = None if uniform is None else uniform()
+        if without is not None and without.misfit <= SLACK * target:
+            why = f"without any jump the misfit is {without.misfit:.4g} against {target:.4g} of noise alone: no weight is too great"
+            return WeightChoice((without,), 0, target, why)
         return _by_discrepancy(solve, first, target)
     if rule == "l_curve":
         trials = [solve(first, None)]
