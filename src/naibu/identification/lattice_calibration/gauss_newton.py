@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import Progress
-from naibu.identification.lattice_calibration.estimate import LatticeEstimate
+from naibu.identification.lattice_calibration.estimate import IMPROVED, LatticeEstimate, estimate_from, interrupted_estimate
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual, evaluated
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
 from naibu.identification.lattice_calibration.intervals.local_regression import LocalRegression
@@ -50,11 +50,6 @@ TELLING = 0.05  # change of a logarithm from which on a step tells of derivative
 ENOUGH = 2e-3  # of the cost, while the noise is still taken as stated
 FARTHEST = 3.0  # change of a logarithm in one iteration, after steps that did what they promised
 POOR, WELL = 0.3, 0.75  # of the promised decrease, from which on steps become shorter, or may become longer
-IMPROVED = (
-    "Intervals rest on derivatives that steps of the search improved, a few percent off, and are not widened to where chi-squared itself "
-    "rises."
-)
-CUT_SHORT = "The search was interrupted before anything told how exact its values are: intervals hold what the weak prior holds."
 IDLE = 2  # steps one after the other that change next to nothing, before the search ends
 
 
@@ -254,7 +249,7 @@ def calibrate_lattice(
     except KeyboardInterrupt:
         if at.best is None or at.problem is None:
             raise
-        return _interrupted(at.problem, at.best, centre, prior_sd, at)
+        return interrupted_estimate(at.problem, at.best, centre, prior_sd, at)
 
 
 def _searched(
@@ -276,20 +271,10 @@ def _searched(
     point, used = _corrected(here, point, prior, most, at)
     count += used
     if not widen:
-        return replace(_estimate(here, point, covariance_at(point, prior_sd), count, at.runs), remarks=(IMPROVED,))
+        return replace(estimate_from(here, point, covariance_at(point, prior_sd), count, at.runs), remarks=(IMPROVED,))
     point = replace(point, slopes=at(here, point.theta).slopes)
     widened = widened_covariance(here, point, centre, prior_sd, at)
-    return replace(_estimate(here, point, widened.covariance, count, at.runs), remarks=widened.remarks(problem.unknowns.names))
-
-
-def _interrupted(problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations) -> LatticeEstimate:
-    """Return the best so far; its derivatives may be those of steps, and in contact they count jumps as information."""
-    if problem.shifts(np.exp(point.theta)) is not None:
-        covariance = unsettled_covariance(point.theta, centre, prior_sd)
-        found = _estimate(problem, point, covariance, at.count, at.runs, finished=False)
-        return replace(found, information=np.zeros_like(covariance), settled=False, remarks=(CUT_SHORT,))
-    covariance = covariance_before_the_minimum(point, centre, prior_sd)
-    return replace(_estimate(problem, point, covariance, at.count, at.runs, finished=False), remarks=(IMPROVED,))
+    return replace(estimate_from(here, point, widened.covariance, count, at.runs), remarks=widened.remarks(problem.unknowns.names))
 
 
 def _in_other_units(point: EvaluatedPoint, old: tuple[float, float], new: tuple[float, float]) -> EvaluatedPoint:
@@ -310,20 +295,9 @@ def _searched_in_contact(
     information = np.linalg.inv(covariance) - np.eye(len(centre)) / prior_sd**2
     if not local.settled:  # derivatives there say nothing of where the least misfit is
         covariance, information = unsettled_covariance(point.theta, centre, prior_sd), np.zeros_like(covariance)
-    found = _estimate(problem, point, covariance, search.iterations + local.rounds, at.runs)
+    found = estimate_from(problem, point, covariance, search.iterations + local.rounds, at.runs)
     open_combinations = identifiability(problem.unknowns.names, information)
     return replace(found, information=information, undetermined=open_combinations, settled=local.settled)
-
-
-def _estimate(
-    problem: InverseProblem, point: EvaluatedPoint, covariance: FloatArray, iterations: int, runs: int, *, finished: bool = True
-) -> LatticeEstimate:
-    factors = noise_factors(problem, point.residual)
-    shown = tuple(f if len(r) else np.nan for f, r in zip(factors, point.residual, strict=True))
-    return LatticeEstimate(
-        problem.unknowns, np.exp(point.theta), covariance, point.information, (shown[0], shown[1]), iterations,
-        runs * len(problem.load_cases), identifiability(problem.unknowns.names, point.information), finished,
-    )  # fmt: skip
 
 
 def estimate_at(
@@ -358,13 +332,13 @@ def estimate_at(
         if not finished:
             point = at(problem, theta, derivatives=False, fine=True)
             slopes = (np.zeros((len(point.residual[0]), len(theta))), np.zeros((len(point.residual[1]), len(theta))))
-            return _interrupted(problem, replace(point, slopes=slopes), theta, prior_sd, at)
+            return interrupted_estimate(problem, replace(point, slopes=slopes), theta, prior_sd, at)
         return _searched_in_contact(problem, theta, theta, prior_sd, 0, at)
     factors = noise_factors(problem, evaluated(problem, theta, derivatives=False, fine=True).residual)
     here = problem.enlarged((max(factors[0], 1.0), max(factors[1], 1.0)))
     residual = evaluated(here, theta, derivatives=False, fine=True).residual
     point = replace(evaluated(here, theta), residual=residual)
-    return _estimate(here, point, covariance_before_the_minimum(point, theta, prior_sd), 0, 3 + len(theta), finished=finished)
+    return estimate_from(here, point, covariance_before_the_minimum(point, theta, prior_sd), 0, 3 + len(theta), finished=finished)
 
 
 def _corrected(
