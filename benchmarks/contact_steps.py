@@ -77,12 +77,29 @@ def sessions(n: int, steps: int, radius: float, tolerance: float) -> None:
     with engine.session(constrained=held(engine)) as free:
         free.step(steps=5)
         row("no sphere", timed(lambda k: free.step(), steps))
+    taken, forces, told = pushed(engine, steps, radius)
+    row("sphere, with friction", taken, told)
+    exact = pushed(dough(n, STEP_S, 1e-4), steps, radius)[1]
+    apart = np.linalg.norm(forces - exact, axis=1) / np.linalg.norm(exact, axis=1).max()
+    root, most = np.sqrt((apart**2).mean()), apart.max()
+    print(
+        f"  forces beside those of tolerance 0.0001, of the largest: {root:.1e} (rms), p99 {np.quantile(apart, 0.99):.1e}, most {most:.1e}"
+    )
+
+
+def pushed(engine: LatticeEngine, steps: int, radius: float) -> tuple[FloatArray, FloatArray, str]:
+    """Return the times of steps (2, steps), ms, the forces of the sphere (steps, 3), mN, and what is told of the solver."""
     ball = spherical_indenter((40.0, 40.0, SIDE_MM + radius), radius, static_friction=0.3, kinetic_friction=0.3)
+    forces = np.empty((steps, 3))
     with engine.session(constrained=held(engine), indenters=[ball]) as session:
         session.step(motions=[IndenterVelocity()], steps=5)
         before = session.iterations
-        found = timed(lambda k: session.step(motions=[IndenterVelocity(hand(k * STEP_S))]), steps)
-        row("sphere, with friction", found, f"{(session.iterations - before) / steps:.1f} iterations, {session.unsettled} unsettled")
+
+        def step(k: int) -> None:
+            forces[k] = session.step(motions=[IndenterVelocity(hand(k * STEP_S))]).indenters[0, 0]
+
+        taken = timed(step, steps)
+        return taken, forces, f"{(session.iterations - before) / steps:.1f} iterations, {session.unsettled} unsettled"
 
 
 def curve(n: int, radius: float, place: tuple[float, float], steps: int = 250) -> FloatArray:

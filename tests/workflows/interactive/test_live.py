@@ -490,7 +490,7 @@ def test_a_taken_port_is_named() -> None:
 
 
 def test_steps_of_a_lattice_on_the_live_page_are_solved_closely_enough() -> None:
-    """Forces of a sphere that goes down and to and fro, beside those of a solver that ends three hundred times later."""
+    """Forces of a sphere that goes down in dough and then to and fro, beside those of a solver with a residual a thousand times smaller."""
     body = touchable("dough-pressed-by-sphere").body
     assert isinstance(body, LatticeBody)
     high = body.points.max(axis=0)
@@ -501,9 +501,10 @@ def test_steps_of_a_lattice_on_the_live_page_are_solved_closely_enough() -> None
         with replace(body, engine=engine).session() as session:
             session.press([*body.fixtures, ball])
             still = [IndenterVelocity() for _ in body.fixtures]
-            for t in 1e-3 * np.arange(600):
-                way = [0.0, 0.0, -10.0] if t < 0.4 else [40.0 * np.cos(9.0 * t), 30.0 * np.sin(7.0 * t), 10.0 * np.sin(15.0 * t)]
+            for t in 1e-3 * np.arange(900):
+                way = [0.0, 0.0, -10.0] if t < 0.4 else [40.0 * np.cos(9.0 * t), 30.0 * np.sin(7.0 * t), -7.0 + 5.0 * np.sin(15.0 * t)]
                 found.append(session.step(np.zeros((2, 3)), [*still, IndenterVelocity(way)]).indenters[0, -1])
         forces.append(np.array(found))
     apart = np.linalg.norm(forces[0] - forces[1], axis=1) / np.linalg.norm(forces[1], axis=1).max()
-    assert np.sqrt((apart**2).mean()) < 1e-3 and np.quantile(apart, 0.99) < 2e-3
+    assert np.sqrt((apart**2).mean()) < 1e-3 and np.quantile(apart, 0.99) < 5e-3
+    assert apart[-100:].max() < 5e-3 and np.linalg.norm(forces[1][-1]) > 100.0  # errors do not add up
