@@ -142,7 +142,7 @@ def beyond_object(name: str, field: DisplacementField, inside: Volume) -> tuple[
     """Say which part of a field lies outside of the object, the voxels of `inside` that are not zero, where that is more than its rim."""
     at = field.at_points()
     index = np.round(inside.to_index(at.points[at.valid])).astype(int)[:, ::-1]
-    within = ((index >= 0) & (index < inside.shape)).all(axis=1)
+    within = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
     within[within] = inside.values[tuple(index[within].T)] != 0
     if (share := 1.0 - float(within.mean())) <= MOST_BEYOND:
         return ()
