@@ -241,6 +241,9 @@ def _identified(model: CalibratedModel, source: Source | None) -> TouchableModel
         f"of {experiment.name}.",
         f"It stands on its table with friction {min(coefficient, STICKING):.2g}; {1.0 / touched.step_s:.0f} steps a second.",
     )
+    if model.reference is not None:
+        material_of_scale, modulus = model.reference
+        said += (f"No modulus is known: that of {material_of_scale} is taken as {modulus:g} kPa, and forces are in proportion to it.",)
     return _doubted(TouchableModel(f"{experiment.name}, touched", said, touched, "equivalent strain, %", nodes, weights), model)
 
 
