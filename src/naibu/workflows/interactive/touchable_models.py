@@ -236,7 +236,7 @@ def _identified(model: CalibratedModel, source: Source | None) -> TouchableModel
         gravity=GRAVITY, normal_stiffness=model.settings.normal_stiffness, tangential_stiffness=model.settings.tangential_stiffness,
     )  # fmt: skip
     nodes, weights = _interpolation(body.mesh, body.marker_points)
-    said = (
+    said: tuple[str, ...] = (
         f"Finite elements of the identified materials, {model.settings.law.replace('_', '-')} law: {body.mesh.n_cells} cells of the body "
         f"of {experiment.name}.",
         f"It stands on its table with friction {min(coefficient, STICKING):.2g}; {1.0 / touched.step_s:.0f} steps a second.",
