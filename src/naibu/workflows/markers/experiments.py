@@ -14,6 +14,7 @@ from naibu._version import __version__
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
 from naibu.core.units import kilopascals
+from naibu.identification.from_markers.checks.marker_checks import check_markers
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.imaging.markers.tracking import FEWEST_COMMON
@@ -78,6 +79,14 @@ def _require_different(experiments: Sequence[Experiment]) -> None:
             first = seen.setdefault(state.markers.points.tobytes(), label)
             if first != label:
                 raise InputError(f"{first} and {label} hold the same positions, which would count twice; give each measurement once")
+
+
+def doubts_of_markers(experiment: Experiment) -> tuple[str, ...]:
+    """Say what `naibu.identify` will doubt or refuse of an experiment, such as exchanged states; its folder can still be corrected."""
+    try:
+        return tuple(doubt.text for doubt in check_markers([experiment]))
+    except InputError as error:
+        return (f"naibu identify will refuse this: {error}",)
 
 
 def require_loaded(experiment: Experiment, state: str) -> None:
