@@ -171,8 +171,8 @@ def touchable(source: str | os.PathLike[str], *, experiment: Source | None = Non
         return _lattice(prepared_study(source))
     if path.is_file():
         raise InputError(
-            f"{source}: files ending in {path.suffix!r} are not read; save a mesh as {' or '.join(MESH_READERS)} (ParaView and meshio do), "
-            f"or give a {MODEL_FILE} or a study (.toml)"
+            f"{source}: is neither a mesh ({', '.join(MESH_READERS)}, which ParaView and meshio save), nor a {MODEL_FILE} or its folder, "
+            "nor a study (.toml)"
         )
     raise InputError(
         f"{source}: is neither a {MODEL_FILE} or its folder, nor a mesh ({', '.join(MESH_READERS)}), nor a study (.toml); what naibu "
