@@ -290,7 +290,7 @@ def report(folder: Path) -> None:
     Parameters
     ----------
     folder
-        Folder with results of 'naibu identify' or 'naibu predict'.
+        Folder with results of 'naibu identify' or 'naibu predict' with markers.
     """
     from naibu.workflows import report as report_workflow
 

@@ -36,6 +36,14 @@ def test_a_file_of_three_axes_is_given_its_indenter(tmp_path: Path) -> None:
     np.testing.assert_allclose(named.force, [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
 
 
+def test_a_spreadsheet_with_decimal_commas(tmp_path: Path) -> None:
+    file = written(tmp_path, "Time (ms);sensor;Fx [N];Fy [N];Fz [N]\n0;left, front;1,5;-2,25;3\n2,5;left, front;1e0;,5;0\n")
+    (found,) = read_force_records([file])
+    np.testing.assert_allclose(found.times_s, [0.0, 0.0025])
+    np.testing.assert_allclose(found.force, [[1500.0, -2250.0, 3000.0], [1000.0, 500.0, 0.0]])
+    assert found.indenter == "left, front"
+
+
 @pytest.mark.parametrize(
     ("text", "told"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from contextlib import closing
 from dataclasses import replace
@@ -16,6 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from served_models import served
 from touched_lattice import touched_lattice
+from virtual_press import Press
 
 from naibu.core.errors import InputError
 from naibu.io.vtk_files import write_vtu
@@ -442,6 +444,15 @@ def test_a_mesh_is_held_at_its_lowest_nodes_and_pressed(tmp_path: Path) -> None:
     np.testing.assert_allclose(frame.positions[low], mesh.points[low], atol=1e-12)
     assert model.body.strain(frame.positions).max() > 5.0
     assert frame.penetration_mm < 0.1
+
+
+def test_forces_of_a_model_of_ratios_are_told_to_be_in_proportion(press: Press, tmp_path: Path) -> None:
+    stored = json.loads((press.results / "model.json").read_text(encoding="utf-8"))
+    for absolute in (True, False):
+        stored["known"]["scale_is_absolute"] = absolute
+        (tmp_path / "model.json").write_text(json.dumps(stored), encoding="utf-8")
+        said = " ".join(touchable(tmp_path / "model.json", experiment=press.folder).sentences)
+        assert ("No modulus is known" in said and "in proportion" in said) is not absolute
 
 
 def test_what_cannot_be_touched_is_refused(tmp_path: Path) -> None:

@@ -222,8 +222,20 @@ def test_pages_are_written_again_without_experiments(press: Press, tmp_path: Pat
         report.report(tmp_path)
 
 
+def sister_of(folder: Path, place: Path) -> Path:
+    """Rename a press to another one whose loaded scans are shifted: the same material, and no copy of a measurement."""
+    other = folder.rename(place / "sister")
+    for state in ("pressed", "pressed_more"):
+        table = rows(other / f"{state}.csv")
+        with (other / f"{state}.csv").open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.DictWriter(stream, list(table[0]))
+            writer.writeheader()
+            writer.writerows(row | {"x_mm": f"{float(row['x_mm']) + 0.25:.6g}"} for row in table)
+    return other
+
+
 def test_experiments_are_predicted_from_each_other(press: Press, experiment_folder: Path, tmp_path: Path) -> None:
-    other = experiment_folder.rename(tmp_path / "sister")
+    other = sister_of(experiment_folder, tmp_path)
     found = identify.identify([press.folder, other], known=KNOWN, settings=COARSE, states=STATE, cross_validate=True)
     assert {(r.experiment, r.state) for r in found.left_out} == {("press", "pressed"), ("sister", "pressed"), ("sister", "pressed_more")}
     assert all(r.rms_mm < 0.6 for r in found.left_out)
@@ -266,7 +278,7 @@ def test_a_worker_that_is_killed_costs_its_fold_only(press: Press, tmp_path: Pat
 def test_an_experiment_that_was_predicted_before_an_interruption_is_not_calibrated_again(
     press: Press, experiment_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    other, out = experiment_folder.rename(tmp_path / "sister"), tmp_path / "out"
+    other, out = sister_of(experiment_folder, tmp_path), tmp_path / "out"
     calibrated: list[list[str]] = []
     calibrate = folds.calibrate
 

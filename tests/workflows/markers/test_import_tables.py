@@ -9,7 +9,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.core.experiment import Loading, Shape
-from naibu.workflows.markers.experiments import load_experiment
+from naibu.workflows.markers.experiments import load_experiment, load_experiments
 from naibu.workflows.markers.import_tables import import_tables
 
 CUBE = {"shape": Shape("box", (60.0, 60.0, 60.0)), "loading": Loading("plate"), "title": "gel"}
@@ -54,6 +54,13 @@ def test_what_is_wrong_with_a_table_names_its_file(tables: tuple[Path, Path], tm
     with pytest.raises(InputError, match=r"Würfel frei.csv: x_mm spans 40") as refused:
         import_tables(free, [pressed], out=tmp_path / "gel", **small)
     assert "meta.toml" not in str(refused.value)
+
+
+def test_one_measurement_under_two_names_is_refused(tables: tuple[Path, Path], tmp_path: Path) -> None:
+    for name in ("gel", "copy"):
+        import_tables(tables[0], [tables[1]], out=tmp_path / name, **CUBE)
+    with pytest.raises(InputError, match="gel/gedrückt and copy/gedrückt hold the same positions, which would count twice"):
+        load_experiments([tmp_path / "gel", tmp_path / "copy"])
 
 
 def test_a_file_of_an_experiment_leads_to_its_folder(tables: tuple[Path, Path], tmp_path: Path) -> None:

@@ -78,6 +78,12 @@ def test_an_experiment_folder_comes_out(scans: list[Path], tmp_path: Path) -> No
     np.testing.assert_allclose(NoiseModel(model_mm=0.0).of_experiment(experiment), experiment.sd_mm)
 
 
+def test_exchanged_scans_are_told(scans: list[Path], tmp_path: Path) -> None:
+    described = ObjectDescription(Shape("box", (36.0, 36.0, 28.0)), Loading("plate"), (), {})
+    run = track(scans[::-1], out=tmp_path / "mine", diameter_mm=DIAMETER, description=described)
+    assert any("the reference configuration and the loaded state exchanged?" in note for note in run.notes)
+
+
 def test_the_page_shows_markers_in_3_d_and_over_the_scans(scans: list[Path], tmp_path: Path) -> None:
     run = track(scans, out=tmp_path / "page", diameter_mm=DIAMETER)
     page = run.page.read_text(encoding="utf-8")

@@ -18,6 +18,7 @@ from naibu.io.files.reading import read_bytes
 MOST_ROWS = 5_000_000
 _UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]$")
 _SHOWN = 40  # letters of a cell in a message
+_DECIMAL_COMMA = re.compile(r"^(\s*[+-]?\d*),(\d+(?:[eE][+-]?\d+)?\s*)$")  # of a cell of a spreadsheet that separates cells otherwise
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,8 +62,8 @@ def read_named_columns(path: Path, kinds: Mapping[str, ColumnKind], labels: tupl
     Parameters
     ----------
     path : Path
-        Text with a row of names, such as ``time_s,fx_N,fy_N,fz_N`` or ``Time (ms);Fx [N];Fy [N];Fz [N]``, separated by commas, semicolons
-        or tabs. Rows that begin with ``#`` are passed over, as are columns of other names.
+        Text with a row of names, such as ``time_s,fx_N,fy_N,fz_N`` or ``Time (ms);Fx [N];Fy [N];Fz [N]``, separated by commas, or by
+        semicolons or tabs with decimal points or commas. Rows that begin with ``#`` are passed over, as are columns of other names.
     kinds : mapping
         What is looked for.
     labels : tuple of str
@@ -97,7 +98,7 @@ def _rows(path: Path) -> list[tuple[int, list[str]]]:
     mark = max(",;\t", key=first.count)
     try:
         rows = [
-            (number, cells)
+            (number, cells if mark == "," else [_DECIMAL_COMMA.sub(r"\1.\2", cell) for cell in cells])
             for number, cells in enumerate(csv.reader(StringIO(text), delimiter=mark), start=1)
             if any(cell.strip() for cell in cells) and not cells[0].lstrip().startswith("#")
         ]

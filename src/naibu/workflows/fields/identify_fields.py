@@ -216,10 +216,10 @@ def identify_fields(
     )  # fmt: skip
     corrected = cubes.region_at is not None and found.mesh_shift is not None
     coarse = blurred(cubes.left_out, cubes.wrong, corrected=corrected)
-    doubts = tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
+    doubts = tuple(told for name, field in measured for told in beyond_object(name, field, inside))
+    doubts += tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
     coarse += cubes.noise
-    cropped = tuple(told for name, field in measured for told in beyond_object(name, field, inside))
-    notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer, *cropped)
+    notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
     result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from naibu.core.arrays import BoolArray, FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
@@ -142,7 +142,7 @@ def beyond_object(name: str, field: DisplacementField, inside: Volume) -> tuple[
     """Say which part of a field lies outside of the object, the voxels of `inside` that are not zero, where that is more than its rim."""
     at = field.at_points()
     index = np.round(inside.to_index(at.points[at.valid])).astype(int)[:, ::-1]
-    within: BoolArray = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
+    within = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
     within[within] = inside.values[tuple(index[within].T)] != 0
     if (share := 1.0 - float(within.mean())) <= MOST_BEYOND:
         return ()

@@ -172,8 +172,8 @@ def touchable(source: str | os.PathLike[str], *, experiment: Source | None = Non
         return _lattice(prepared_study(source))
     if path.is_file():
         raise InputError(
-            f"{source}: files ending in {path.suffix!r} are not read; save a mesh as {' or '.join(MESH_READERS)} (ParaView and meshio do), "
-            f"or give a {MODEL_FILE} or a study (.toml)"
+            f"{source}: is neither a mesh ({', '.join(MESH_READERS)}, which ParaView and meshio save), nor a {MODEL_FILE} or its folder, "
+            "nor a study (.toml)"
         )
     raise InputError(
         f"{source}: is neither a {MODEL_FILE} or its folder, nor a mesh ({', '.join(MESH_READERS)}), nor a study (.toml); what naibu "
@@ -237,11 +237,14 @@ def _identified(model: CalibratedModel, source: Source | None) -> TouchableModel
         gravity=GRAVITY, normal_stiffness=model.settings.normal_stiffness, tangential_stiffness=model.settings.tangential_stiffness,
     )  # fmt: skip
     nodes, weights = _interpolation(body.mesh, body.marker_points)
-    said = (
+    said: tuple[str, ...] = (
         f"Finite elements of the identified materials, {model.settings.law.replace('_', '-')} law: {body.mesh.n_cells} cells of the body "
         f"of {experiment.name}.",
         f"It stands on its table with friction {min(coefficient, STICKING):.2g}; {1.0 / touched.step_s:.0f} steps a second.",
     )
+    if model.reference is not None:
+        material_of_scale, modulus = model.reference
+        said += (f"No modulus is known: that of {material_of_scale} is taken as {modulus:g} kPa, and forces are in proportion to it.",)
     return _doubted(TouchableModel(f"{experiment.name}, touched", said, touched, "equivalent strain, %", nodes, weights), model)
 
 

@@ -14,8 +14,10 @@ from naibu._version import __version__
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment
 from naibu.core.units import kilopascals
+from naibu.identification.from_markers.checks.marker_checks import check_markers
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
+from naibu.imaging.markers.tracking import FEWEST_COMMON
 from naibu.io.experiment_folder.reader import META_FILE, read_experiment
 from naibu.io.files.paths import require_usable_path
 
@@ -54,7 +56,7 @@ def load_experiments(experiments: Sequence[Source] | Source) -> list[Experiment]
     Raises
     ------
     InputError
-        Two experiments of one name, or a source that cannot be used.
+        Two experiments of one name, one loaded state twice, or a source that cannot be used.
     """
     sources = [experiments] if isinstance(experiments, str | os.PathLike | Experiment) else list(experiments)
     loaded = [load_experiment(e) for e in sources]
@@ -62,7 +64,29 @@ def load_experiments(experiments: Sequence[Source] | Source) -> list[Experiment]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"{names.count(name)} experiments are called {name!r}; give each once, or rename a folder")
+    _require_different(loaded)
     return loaded
+
+
+def _require_different(experiments: Sequence[Experiment]) -> None:
+    """Refuse positions that are there twice, under other names: they would count as two measurements, and narrow all intervals."""
+    seen: dict[bytes, str] = {}
+    for e in experiments:
+        for state in e.loaded_states:
+            if state.markers is None or len(state.markers.ids) < FEWEST_COMMON:
+                continue  # what is too little to identify from is refused elsewhere
+            label = f"{e.name}/{state.name}"
+            first = seen.setdefault(state.markers.points.tobytes(), label)
+            if first != label:
+                raise InputError(f"{first} and {label} hold the same positions, which would count twice; give each measurement once")
+
+
+def doubts_of_markers(experiment: Experiment) -> tuple[str, ...]:
+    """Say what `naibu.identify` will doubt or refuse of an experiment, such as exchanged states; its folder can still be corrected."""
+    try:
+        return tuple(doubt.text for doubt in check_markers([experiment]))
+    except InputError as error:
+        return (f"naibu identify will refuse this: {error}",)
 
 
 def require_loaded(experiment: Experiment, state: str) -> None:

@@ -15,13 +15,13 @@ from naibu.core.arrays import FloatArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.experiment import Experiment, Loading, Shape
 from naibu.core.markers import Markers
-from naibu.identification.from_markers.checks.marker_checks import check_markers
 from naibu.imaging.markers.linking.motion_coherence import require_coherent, strays_named
 from naibu.imaging.markers.tracking import FEWEST_COMMON
 from naibu.io.experiment_folder.reader import META_FILE, read_experiment
 from naibu.io.tables.marker_tables import import_markers, state_name, write_experiment_folder
 from naibu.io.tables.table_cells import MM_PER_UNIT
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.markers.experiments import doubts_of_markers
 from naibu.workflows.markers.tilted_tables import UprightTables, Vertical, upright_tables
 
 LEAST_SHARE = 0.15  # of the object's extent, which markers span; below, another unit is suspected
@@ -78,15 +78,7 @@ def import_tables(
     description["stated_mm"] = {state_name(name): height for name, height in (description.get("stated_mm") or {}).items()}
     experiment = _rehearsed(out, upright.tables, description, dict(zip(tables, (initial, *loaded), strict=True)))
     write_experiment_folder(out, upright.tables[first], {name: upright.tables[name] for name in others}, **description)
-    return (*notes, *upright.notes, *_doubts(experiment))
-
-
-def _doubts(experiment: Experiment) -> list[str]:
-    """What `naibu.identify` will doubt or refuse: the description that follows from the options can still be corrected in the folder."""
-    try:
-        return [doubt.text for doubt in check_markers([experiment])]
-    except InputError as error:
-        return [f"naibu identify will refuse this: {error}"]
+    return (*notes, *upright.notes, *doubts_of_markers(experiment))
 
 
 def _rehearsed(

@@ -141,15 +141,10 @@ def read_pair(
     Raises
     ------
     InputError
-        A file that cannot be read, one scan given twice, or a mask or truth on another grid.
+        A file that cannot be read, or a mask or truth on another grid.
     """
     require_lengths(spacing_mm=spacing_mm)
     a, b = (read_volume(p, spacing_mm=spacing_mm, missing=True) for p in (reference, deformed))
-    if np.array_equal(a.values, b.values, equal_nan=True):
-        raise InputError(
-            f"{Path(reference).name} and {Path(deformed).name} hold the same intensities at every voxel, so that nothing moved; "
-            "is one scan given twice?"
-        )
     masks: list[BoolArray | None] = [None, None]
     for k, (path, grid, scan) in enumerate(((mask, a, reference), (deformed_mask, b, deformed))):
         if path is not None:
@@ -268,7 +263,7 @@ def sense_pair(
     Raises
     ------
     InputError
-        As `naibu.imaging.measure_displacement.measure_displacement`; also a folder that cannot be written to.
+        As `naibu.imaging.measure_displacement.measure_displacement`; also one scan given twice, and a folder that cannot be written to.
     """
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     began = time.perf_counter()
@@ -282,6 +277,9 @@ def recorded(pair: Pair, measured: MeasuredDisplacement, seconds: float, folder:
     """Return a measured displacement with its figures, and write it where a folder is given (see `sense_pair`)."""
     if not (measured.mask & measured.displacement.valid).any():
         raise InputError("the displacement was found nowhere in the object: check that both scans show the same object")
+    if np.array_equal(pair.reference.values, pair.deformed.values, equal_nan=True):
+        first, second = pair.names
+        raise InputError(f"{first} and {second} hold the same intensities at every voxel, so that nothing moved; is one scan given twice?")
     run = SenseRun(measured, seconds, figures(pair, measured), pair)
     return run if folder is None else replace(run, files=written_together(folder, FILES, lambda at: _written(pair, run, at)))
 

@@ -14,6 +14,7 @@ from naibu.core.experiment import Layer, Loading, Shape
 from naibu.core.progress import Progress, report_progress
 from naibu.imaging.markers.detection import Polarity
 from naibu.imaging.markers.tracking import FEWEST_COMMON, TrackedMarkers, track_markers
+from naibu.io.experiment_folder.reader import read_experiment
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.provenance import input_record
 from naibu.io.images import read_volume
@@ -22,6 +23,7 @@ from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.markers.experiments import doubts_of_markers
 from naibu.workflows.markers.tilted_tables import Vertical, upright_tables
 from naibu.workflows.measurement.track_page import track_chapter, track_rows
 from naibu.workflows.results.output_folder import output_folder
@@ -234,4 +236,5 @@ def _written(
     return [target / "meta.toml", *(target / f"{n}.csv" for n in tracked.names)], (
         *([upright.told] if upright.told else []),
         *upright.notes,
+        *doubts_of_markers(read_experiment(target)),
     )

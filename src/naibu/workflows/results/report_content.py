@@ -81,7 +81,9 @@ def accuracy_table(calibration: Calibration, baselines: Mapping[str, Mapping[str
     if unseen:
         note += " Left out: the other experiments identified the parameters."
     if names:
-        note += " The last columns are 3-D distances of simple models."
+        note += (
+            " The last columns: 3-D distances that the best rigid motion, the best affine map, and linear elasticity without slip leave."
+        )
     return Table("Measured against predicted markers", columns, tuple(rows), note=note)
 
 

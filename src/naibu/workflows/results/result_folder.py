@@ -308,7 +308,12 @@ def rewrite_reports(folder: Path) -> list[Path]:
         except InputError as error:
             raise InputError(f"{stored}: {str(error).removeprefix(f'{stored}: ')}; run the command that made it again") from error
         pages.append(write_atomically(stored.with_suffix(".html"), page))
+    if not folder.is_dir():
+        raise InputError(f"{folder}: holds no results, for there is no such folder; check the path")
     if not pages:
         stored_as = f"{REPORT_STEM}.json or {PREDICTED_STEM}.json"
-        raise InputError(f"{folder}: holds no results ({stored_as}); name a folder that 'naibu identify' or 'naibu predict' wrote")
+        raise InputError(
+            f"{folder}: holds no results of markers ({stored_as}); name a folder that 'naibu identify' or 'naibu predict' wrote of them. "
+            "Pages of displacement fields are written with their results only"
+        )
     return pages
