@@ -275,7 +275,7 @@ def _warnings(problem: StudyProblem, estimate: LatticeEstimate, before: Compared
     if not problem.unknowns.study.tied:
         found.append(
             "In contact the intervals are not confirmed: jumps, as points begin to slip, count in them as errors of the model, but in "
-            "trials with known truth one of 66 was still too narrow (benchmarks/lattice_calibration.py). Take them as the least "
+            "trials with known truth one of 121 was still too narrow (benchmarks/lattice_calibration.py). Take them as the least "
             "uncertainty."
         )
     found += estimate.remarks
