@@ -10,7 +10,13 @@ from naibu.imaging.measure_displacement import measured_by
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.correlate import Correlation, correlate_volumes
 from naibu.imaging.volume_correlation.results.block_displacements import LEFT
-from naibu.imaging.volume_correlation.results.cell_errors import BENDING_BIAS, DILATATION_BIAS, bias_covariance, biases
+from naibu.imaging.volume_correlation.results.cell_errors import (
+    BENDING_BIAS,
+    DILATATION_BIAS,
+    bias_covariance,
+    biases,
+    variance_of_one_line,
+)
 from naibu.imaging.volume_correlation.settings import CorrelationSettings
 from naibu.validation.scanners.textures import Texture
 from naibu.validation.specimens.textured_sphere import squeezed_ball
@@ -149,3 +155,14 @@ def test_regions_are_longer_along_layers_than_across_them() -> None:
     assert variance[1] > 1.4**2 * max(variance[0], variance[2])
     held = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]) < 7.815  # chi-squared, 95 %
     assert held.mean() > 0.95
+
+
+@pytest.mark.parametrize("size", [0.1, 0.5, 1.0, 2.0, 5.0, 100.0])
+def test_regions_hold_a_displacement_along_one_line_beside_other_errors(size: float) -> None:
+    """Drawn errors of unit variance along every axis, and along one of them a displacement of this size besides."""
+    rng = np.random.default_rng(0)
+    error = rng.normal(size=(100_000, 3))
+    error[:, 1] += size * rng.normal(size=len(error))
+    variance = 1.0 + float(variance_of_one_line(np.array([size**2 / 3.0]), np.array([1.0]))[0])
+    held = (error**2).sum(axis=1) < 7.815 * variance
+    assert 0.94 < held.mean() < 0.96

@@ -17,10 +17,13 @@ REMAINING = 5.0  # empirical: last steps that a cell which has not converged may
 # empirical: standard deviation of the bias by the penalties of bending and of dilatation along an axis, root mean square over three, in
 # lengths of the change that penalising the field once more makes. That by dilatation shows in legs, most beside bones, that by bending in
 # chests
-BENDING_BIAS, DILATATION_BIAS, BIAS_TOLERANCE = 2.0, 2.3, 0.03
+BENDING_BIAS, DILATATION_BIAS, BIAS_TOLERANCE = 1.75, 2.05, 0.03
 # empirical: parts of the variance of the bias along the change that penalising once more makes, and as the samples lie. Both say in which
 # direction a penalty prevails, as along the skin in fat without texture; along every axis alike, regions were too narrow there
 ALONG, OPEN = 0.5, 0.4
+# variance along every axis, in thirds of the square of a displacement along one line of unknown direction, whose 95 % region holds 95 % of
+# such: from quantiles of chi-squared of one and three degrees of freedom. A third itself would hold 89 %
+ONE_LINE = 3.0 * 3.841 / 7.815
 # empirical: mean square of the residuals of a cell, in variances of the noise, beyond which structures lie at the wrong place there. Edges
 # in legs reach 8 in one cell of a hundred; lungs that slide by 5 to 17 mm along the chest wall 8 to 100 in one cell of twenty
 MISPLACED = 8.0
@@ -87,6 +90,17 @@ def bias_covariance(fit: CorrelationFit, bias: Sequence[Float32Array], sampled: 
     rest = OPEN * sampled / np.maximum(open_, 1e-30) + (1.0 - ALONG - OPEN) / 3.0 * np.eye(3)
     # `biases` are as large as the deviation along every axis
     return np.asarray(3.0 * (ALONG * along + size * rest))
+
+
+def variance_of_one_line(variance: FloatArray, others: FloatArray) -> FloatArray:
+    """Return the variance (m,) along every axis that displacements along one line need, of `variance` (m,) along every axis in the mean.
+
+    Beside other errors, of variance `others` (m,), regions have to be wider the more of the sum lies along one line: from the mean itself,
+    beside much else, to `ONE_LINE` times that, where there is nothing else. In between, a straight line in the share of the sum holds 95 %
+    to within 1 %.
+    """
+    share = variance / np.maximum(variance + others, 1e-30)
+    return np.asarray(variance * (1.0 + (ONE_LINE - 1.0) * share))
 
 
 def misplacement_variance(fit: CorrelationFit, misfit: FloatArray, unlike: BoolArray | None = None) -> FloatArray:

@@ -24,6 +24,7 @@ from naibu.imaging.volume_correlation.results.cell_errors import (
     per_cell,
     sampled_covariance,
     strain_variance,
+    variance_of_one_line,
 )
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import InclusionMotion
 from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable_slice
@@ -311,9 +312,10 @@ def collected(
     misplaced = misplacement_variance(fit, misfit, content.unlike)
     sampled = sampled_covariance(fit, samples)
     taken = bias_covariance(fit, bias, sampled)
-    biased = np.trace(taken, axis1=1, axis2=2) / 3.0 + hidden[0]
-    variance = hidden[0] + remaining + misplaced
-    covariance = per_cell(system.grid, fit, sampled + taken + variance[:, None, None] * np.eye(3))
+    others = sampled + taken + (remaining + misplaced)[:, None, None] * np.eye(3)
+    lost = variance_of_one_line(hidden[0], np.trace(others, axis1=1, axis2=2) / 3.0)
+    biased = np.trace(taken, axis1=1, axis2=2) / 3.0 + lost
+    covariance = per_cell(system.grid, fit, others + lost[:, None, None] * np.eye(3))
     strain_sd = np.sqrt(
         strain_variance(fit, c, samples, bias) + hidden[1] + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
     )

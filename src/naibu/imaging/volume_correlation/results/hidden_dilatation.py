@@ -28,9 +28,6 @@ SHIFTS = 1.22074408460575947536 ** -np.arange(1.0, 4.0)
 SPREAD = 0.7  # cells: SD of the window in which cells share what is hidden
 REACH = 1.2 * RADIUS  # cells: within which the displacement is lost
 MOST_EVIDENCE = 15.0  # logarithm of how much more probable a part at one place is than at another, beyond which it does not matter
-# variance along every axis, in squares of a displacement along one line of unknown direction, whose 95 % region holds 95 % of such:
-# quantiles of chi-squared of one and of three degrees of freedom. With its mean square along an axis, a third, 89 % would be held
-ONE_LINE = 3.841 / 7.815
 RESPONSE_TOLERANCE = 0.01  # of the linear solves: conjugate gradients find the smooth part, in which the parts of a lattice differ, last
 
 
@@ -173,7 +170,7 @@ def hidden_dilatation(
         # noise and what was assumed to be the largest dilatation bound it
         square = np.minimum((work / information) ** 2 + 1.0 / (information / louder + LARGEST**-2), LARGEST**2)
         evidence = np.exp(np.minimum(0.5 * work**2 / (louder * information), MOST_EVIDENCE))
-        moved = ONE_LINE * (system.at_middles(lost[:, :, k], every=True) ** 2).sum(axis=1)
+        moved = (system.at_middles(lost[:, :, k], every=True) ** 2).sum(axis=1) / 3.0
         strained = strain_square(deformation, gradients_of(fit, lost[:, :, k]))
         here = trial.of_cell[k]
         weight = evidence[here] * ((away < REACH) & some)
