@@ -321,12 +321,7 @@ def collected(
     )
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
     valid = np.zeros(volume.shape, dtype=bool)
-    inside = level.mask.copy()
-    answered = (content.matched & ~content.unlike)[fit.cell_of_voxel]
-    for inclusion in fit.inclusions:
-        answered[inclusion.voxels] = True
-    inside[level.mask] = answered & level.shows(level.index * level.spacing + fit.displacement)
-    valid[box] = inside
+    valid[box] = _answered(fit, content)
     axes = [np.arange(n) * s for n, s in zip(volume.shape[::-1], volume.spacing_mm, strict=True)]
     along = [system.grid.matrix(a, axes[a]) for a in range(3)]
     vectors = np.full((*volume.shape, 3), np.nan)
@@ -355,6 +350,17 @@ def collected(
         of_strain, of_bias, of_place, bent, dilated, fit.residual_sd,
         maps[0], maps[1], converged, inclusions, motions, _status(system.grid, volume, converged),
     )  # fmt: skip
+
+
+def _answered(fit: CorrelationFit, content: CommonContent) -> BoolArray:
+    """Return the voxels in the box around the object that have a displacement: content that both scans show, and rigid inclusions."""
+    level = fit.level
+    inside = level.mask.copy()
+    answered = (content.matched & ~content.unlike)[fit.cell_of_voxel]
+    for inclusion in fit.inclusions:
+        answered[inclusion.voxels] = True
+    inside[level.mask] = answered & level.shows(level.index * level.spacing + fit.displacement)
+    return inside
 
 
 def _middles_mm(grid: SplineGrid, volume: Volume, which: BoolArray) -> FloatArray:
