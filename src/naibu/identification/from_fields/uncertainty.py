@@ -23,6 +23,7 @@ PROBES = 24
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
 POISSON_POORLY = 0.1
 NOT_DETERMINED = "not determined"
+UNIT = "the unit of the others"  # without a standard deviation, beyond rounding
 MESH_DEPENDENT = "not determined (depends on the mesh)"
 RESOLVED = 0.5
 
@@ -211,6 +212,8 @@ def grade(of_young: float, *, usable: bool, sure: bool, apart: bool) -> str:
         return NOT_DETERMINED
     if not usable:
         return "not to be used"
+    if of_young < 1e-9:
+        return UNIT
     if apart:
         return MESH_DEPENDENT
     if of_young * float(ndtri(0.975)) > np.log(UNDETERMINED):

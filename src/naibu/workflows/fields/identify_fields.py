@@ -18,6 +18,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
+from naibu.identification.from_fields.assumptions import holds
 from naibu.identification.from_fields.estimate import TOO_COARSE
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
@@ -307,7 +308,7 @@ def table_of_assumptions(result: FieldIdentification) -> Table:
         for one in found.assumptions:
             young, poisson = young_and_poisson(one.applied(found.theta))
             for name, e, nu, (low, high) in zip(found.zones.names, young, poisson, inside, strict=True):
-                rows.append((one.text, name, float(e), float(nu), "yes" if low <= e <= high else "no"))
+                rows.append((one.text, name, float(e), float(nu), "yes" if holds(low, high, e) else "no"))
     columns = ("other assumption", "zone", f"Young's modulus, {result.unit}", "Poisson's ratio", "modulus within the interval above")
     return Table("Moduli under other assumptions", columns, tuple(rows))
 
