@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from naibu.identification.from_fields.assumptions import Assumption
+from naibu.identification.from_fields.assumptions import Assumption, holds
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 
 
@@ -27,3 +27,8 @@ def test_what_would_be_less_compressible_than_nothing_is_incompressible() -> Non
 def test_small_changes_are_those_of_the_logarithms() -> None:
     theta, change = np.log([3.0, 8.0]), np.array([1e-4, -2e-4])
     assert Assumption("other", change, 0.0).applied(theta) == pytest.approx(theta + change, abs=1e-7)
+
+
+def test_rounding_does_not_take_a_unit_out_of_its_interval() -> None:
+    assert holds(1.0, 1.0, 1.0 + 1e-15) and holds(1.0, 1.0, 1.0 - 1e-15)
+    assert not holds(1.0, 2.0, 2.001) and not holds(1.0, 2.0, 0.999)

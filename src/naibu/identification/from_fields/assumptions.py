@@ -23,6 +23,7 @@ OTHER_YOUNG, OTHER_POISSON = 0.1, 0.02  # changes whose effect is stated: relati
 MOST_POISSON = 0.499
 OTHER_LAW: dict[LawName, LawName] = {"linear": "neo_hookean", "neo_hookean": "linear"}
 LAW_NAMES = {"linear": "small strain", "neo_hookean": "a neo-Hookean law at finite strain"}
+ROUNDING = 1e-9  # of the unit of relative moduli, whose interval has no width
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,6 +114,11 @@ def covariance_of(found: tuple[Assumption, ...], size: int) -> FloatArray:
     return out
 
 
+def holds(low: float, high: float, value: float) -> bool:
+    """Whether an interval of positive moduli holds a value, but for rounding."""
+    return bool(low * (1.0 - ROUNDING) <= value <= high * (1.0 + ROUNDING))
+
+
 def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray, within: FloatArray) -> tuple[str, ...]:
     """Say what other assumptions would do to moduli that are determined, at most three each, and where that leaves their intervals.
 
@@ -134,7 +140,7 @@ def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray, with
         rows = [
             f"{zones.names[i]} {100 * (other[i] / young[i] - 1):+.2g} %, Poisson's ratio {ratio[i] - poisson[i]:+.3f}" for i in bounded[:3]
         ]
-        out = [name for name, e, (low, high) in zip(zones.names, other, within, strict=True) if not low <= e <= high]
+        out = [name for name, e, (low, high) in zip(zones.names, other, within, strict=True) if not holds(low, high, e)]
         left = f" {_named(out)} would leave the interval, which takes this assumption as given." if out else ""
         lines.append(f"{one.text[0].upper()}{one.text[1:]}, Young's modulus would change: {'; '.join(rows)}.{left}")
     return tuple(lines)

@@ -24,6 +24,8 @@ UNBOUNDED = 1e3  # a factor between estimate and bound beyond which the data giv
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
 POISSON_POORLY = 0.1
 NOT_DETERMINED = "not determined"
+EXACT = 1e-9  # standard deviation of a logarithm that is rounding: that of the modulus whose multiples the others are
+UNIT = "the unit of the others"
 MESH_DEPENDENT = "not determined (depends on the mesh)"
 RESOLVED = 0.5
 
@@ -215,6 +217,8 @@ def grade(of_young: float, *, usable: bool, sure: bool, apart: bool) -> str:
         return NOT_DETERMINED
     if not usable:
         return "not to be used"
+    if of_young < EXACT:
+        return UNIT
     if apart:
         return MESH_DEPENDENT
     if of_young * float(ndtri(0.975)) > np.log(UNDETERMINED):

@@ -18,6 +18,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
+from naibu.identification.from_fields.assumptions import holds
 from naibu.identification.from_fields.estimate import TOO_COARSE
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
@@ -310,7 +311,7 @@ def table_of_assumptions(result: FieldIdentification) -> Table:
             for name, e, nu, (low, high) in zip(found.zones.names, young, poisson, inside, strict=True):
                 if not np.isfinite(high):  # of a modulus that may be anything, a change to first order says nothing
                     continue
-                rows.append((one.text, name, float(e), float(nu), "yes" if low <= e <= high else "no"))
+                rows.append((one.text, name, float(e), float(nu), "yes" if holds(low, high, e) else "no"))
     columns = ("other assumption", "zone", f"Young's modulus, {result.unit}", "Poisson's ratio", "modulus within the interval above")
     return Table("Moduli under other assumptions", columns, tuple(rows))
 

@@ -35,6 +35,10 @@ from naibu.identification.from_fields.uncertainty import Uncertainty, intervals,
 from naibu.identification.from_fields.verdict_within_cells import with_limits
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
+ONE_MATERIAL = (
+    "One material explains the measurement: no difference of stiffness can be told from its noise, which does not mean that there is none."
+)
+
 
 def identify_relative_map(
     mesh: Mesh,
@@ -123,7 +127,7 @@ def _relative(found: FieldEstimate) -> FieldEstimate:
     zone = int(np.argmax(volume))
     unit = float(logarithm[zone])
     theta, uncertainty = _divided(found.theta, unit), relative_to(found.uncertainty, found.theta, zone)
-    others = tuple(replace(one, theta=_divided(one.theta, float(one.theta[zone]))) for one in found.assumptions)
+    others = tuple(replace(one, theta=_divided(one.theta, _of_unit(one, found.theta, zone))) for one in found.assumptions)
     regularized = found.regularized and (found.regularized[0] / np.exp(unit), found.regularized[1])
     assert found.verdict is not None  # of regions that were fitted without a penalty
     judged = with_limits(replace(found.verdict, limits=""), found.zones.names, None, intervals(theta, uncertainty)[0], "")
@@ -132,6 +136,12 @@ def _relative(found: FieldEstimate) -> FieldEstimate:
         found, theta=theta, uncertainty=uncertainty, assumptions=others, regularized=regularized, budget=None,
         identifiability=_in_words(found, theta, uncertainty, others),
     )  # fmt: skip
+
+
+def _of_unit(other: Assumption, theta: FloatArray, zone: int) -> float:
+    """Return by how much another assumption changes the logarithm of Young's modulus of a zone."""
+    after, before = (young_and_poisson(t)[0][zone] for t in (other.applied(theta), theta))
+    return float(np.log(after / before))
 
 
 def _divided(theta: FloatArray, unit: float) -> FloatArray:
@@ -144,7 +154,8 @@ def _in_words(found: FieldEstimate, theta: FloatArray, uncertainty: Uncertainty,
     assert found.verdict is not None  # of regions that were fitted without a penalty
     limits = tuple(line for line in found.identifiability if line == TOO_COARSE)
     measure = f"Moduli are multiples of that of {found.zones.names[int(np.argmax(_volumes(found)))]}, the largest region."
-    return statement(found.verdict, found.zones, theta, uncertainty, others, limits=limits, measure=(measure,))
+    alone = (ONE_MATERIAL,) * (found.zones.count == 1)
+    return statement(found.verdict, found.zones, theta, uncertainty, others, limits=limits, measure=(*alone, measure))
 
 
 def _volumes(found: FieldEstimate) -> FloatArray:
