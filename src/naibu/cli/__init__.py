@@ -39,6 +39,7 @@ from naibu.cli.shell.run_record import RunRecord, current_run, recorded_run
 from naibu.cli.shell.verbs import START, verb
 from naibu.core.errors import ConvergenceError, NaibuError, WorkerLostError
 from naibu.core.memory import is_out_of_memory
+from naibu.workflows.results.output_folder import no_empty_folders
 
 OUTPUT = Group("Output of every verb", sort_key=50)
 
@@ -169,8 +170,9 @@ def _finish(run: RunRecord, code: int) -> None:
 def _ended() -> None:
     """Run the verb; every error ends with its message and exit code."""
     try:
-        require_room(_verb())
-        _run()
+        with no_empty_folders():
+            require_room(_verb())
+            _run()
     except CycloptsError as error:
         fail(usage_error(" ".join(str(error).split()), app, current_run().verb), BAD_INPUT)
     except NaibuError as error:

@@ -6,6 +6,7 @@ import os
 import tempfile
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from pathlib import Path
 
 from naibu.core.errors import InputError
@@ -13,6 +14,7 @@ from naibu.io.files.atomic import remove_orphans
 from naibu.io.files.paths import require_usable_path
 
 _NAMED = 3  # files that a message names
+_MADE: ContextVar[list[Path] | None] = ContextVar("folders that a run has made", default=None)
 
 
 def output_folder(
@@ -41,6 +43,8 @@ def output_folder(
         It cannot be made, or not be written to, or holds one of the files.
     """
     folder = require_usable_path(out, written=True)
+    if (made := _MADE.get()) is not None:
+        made += [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -63,19 +67,28 @@ def output_folder(
 
 @contextmanager
 def folder_of_results(out: str | os.PathLike[str], files: Iterable[str] = (), *, overwrite: bool = False) -> Iterator[Path]:
-    """Make a folder as `output_folder` does, for a run that may find its input useless: it is taken away again if nothing was written.
+    """Make a folder as `output_folder` does, for a run that may find its input useless: see `no_empty_folders`.
 
     Raises
     ------
     InputError
         See `output_folder`.
     """
-    wanted = require_usable_path(out, written=True)
-    new = [folder for folder in (wanted, *wanted.parents) if not folder.exists()]
-    try:
+    with no_empty_folders():
         yield output_folder(out, files, overwrite=overwrite)
+
+
+@contextmanager
+def no_empty_folders() -> Iterator[None]:
+    """Take away the folders that `output_folder` made within this context, if an error leaves it before anything was written to them."""
+    made: list[Path] = []
+    before = _MADE.set(made)
+    try:
+        yield
     except BaseException:
-        with suppress(OSError):  # the first that is not empty, or was not made
-            for folder in new:
+        for folder in sorted(made, key=lambda each: len(each.parts), reverse=True):
+            with suppress(OSError):  # not empty, or never made
                 folder.rmdir()
         raise
+    finally:
+        _MADE.reset(before)
