@@ -157,9 +157,7 @@ def drive_live_simulation(
     if not heard:
         raise InputError(f"no answer came from port {port}; start naibu live with that port for haptic devices first")
     times, delays, flags, forces, steps = (np.array(values) for values in zip(*heard, strict=True))
-    return DeviceRecord(
-        times, forces, steps, delays, flags, device.work, most, len(late), overtaken, np.array(arrived), np.array(late)
-    )
+    return DeviceRecord(times, forces, steps, delays, flags, device.work, most, len(late), overtaken, np.array(arrived), np.array(late))
 
 
 def _sent(line: socket.socket, packet: bytes) -> None:
