@@ -2,7 +2,9 @@
 
 A simulated device in a process of its own leads the sphere of a live lattice by UDP on the loopback interface: down into the body, then to
 and fro in it. Answers and poses are lost and overtaken, both ways. Percentiles are over all answers; a gap is the time between two answers
-that the device applied.
+that the device applied. What of it is the device's own is told apart: a pause is the time between two answers as they reached the machine's
+side of the line, lost ones among them, whenever the device read them; and lateness is by how much the device itself was late. Both threads
+ask to be scheduled first, which a system permits or not.
 
 Run: ``OMP_NUM_THREADS=1 python benchmarks/haptics.py [--seconds 60] [--loss 0.01] [--reordering 0.01] [--nodes 9] [--gel]``; ``--gel``
 takes a cube of finite elements in place of the lattice, which is felt between its steps of 1/60 s.
@@ -19,6 +21,7 @@ import socket
 import numpy as np
 
 from naibu.core.arrays import FloatArray
+from naibu.core.thread_priority import scheduled_first
 from naibu.mechanics import Assembler, LatticeEngine, box_mask, classic_lattice, elements, lattice_mesh, lattice_parameters, material
 from naibu.meshing import boundary_faces, box, to_tetra
 from naibu.simulation import FiniteElementBody, ForceLimits, LatticeBody, SimulatedDevice
@@ -80,18 +83,25 @@ def main() -> None:
         pool.apply(driven, (port, 1.0, 0.0, 0.0))  # compiled
         record = pool.apply(driven, (port, given.seconds, given.loss, given.reordering))
         steps = loop.latest()[1].steps_per_s
+    with scheduled_first() as permitted:
+        pass
     shares = (50.0, 99.0, 99.9, 100.0)
     print(f"{given.nodes}^3 nodes, {given.seconds:g} s, {record.sent} poses, {len(record.heard_s)} answers applied, {os.cpu_count()} cores")
     print(f"lost {given.loss:.1%}, reordered {given.reordering:.1%} each way; {record.overtaken} answers overtaken")
     print(f"steps a second at the end: {steps:.0f}")
     for name, values in (
         ("gap, ms", 1e3 * record.gaps_s),
+        ("pause, ms", 1e3 * record.arrival_gaps_s),
+        ("lateness, ms", 1e3 * record.late_s),
         ("pose to force, ms", 1e3 * record.delays_s),
         ("force step, mN", record.steps_mn),
     ):
         found = "   ".join(f"{share:g} % {value:.3f}" for share, value in zip(shares, np.percentile(values, shares), strict=True))
         print(f"{name:18s} {found}")
-    print(f"gaps above 5 ms: {int((record.gaps_s > 5e-3).sum())}; answers that found no pose for 100 ms: {int(record.stale.sum())}")
+    above = [int((values > 5e-3).sum()) for values in (record.gaps_s, record.arrival_gaps_s, record.late_s)]
+    print(f"above 5 ms: {above[0]} gaps, {above[1]} pauses of the simulation, {above[2]} times the device was late")
+    print(f"load {os.getloadavg()[0]:.1f}; scheduled first: {'yes' if permitted else 'no'}; lateness and pauses at once are the machine's")
+    print(f"answers that found no pose for 100 ms: {int(record.stale.sum())}")
     print(f"limit of a step {limits.step_mn:g} mN; steps above it: {int((record.steps_mn > limits.step_mn * (1 + 1e-9)).sum())}")
     print(f"largest force {np.linalg.norm(record.forces, axis=1).max():.0f} mN, limit {limits.force_mn:g}")
     print(f"energy to the device: at most {record.most_work:.1f} mN mm (bound {limits.energy_mn_mm:g}), {record.work:.0f} in the end")

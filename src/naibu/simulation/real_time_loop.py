@@ -6,9 +6,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 from naibu.core.errors import NaibuError
+from naibu.core.thread_priority import scheduled_first
 from naibu.simulation.frame import Frame
 from naibu.simulation.haptics.haptic_loop import HapticHand, require_haptic_steps
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
@@ -58,7 +60,8 @@ class RealTimeLoop:
     clock, sleep : callable
         Time and waiting, s.
     hand : HapticHand, optional
-        A haptic device that leads the tool; frames are then single steps, of which one is shown every 1/60 s.
+        A haptic device that leads the tool; frames are then single steps, of which one is shown every 1/60 s, and the thread is scheduled
+        first where the system permits it (`naibu.core.thread_priority.scheduled_first`).
 
     Raises
     ------
@@ -145,10 +148,11 @@ class RealTimeLoop:
 
     def _run(self) -> None:
         try:
-            due = self.clock()
-            while not self._stop.is_set():
-                self._obey()
-                due = self._once(due)
+            with nullcontext() if self.hand is None else scheduled_first():
+                due = self.clock()
+                while not self._stop.is_set():
+                    self._obey()
+                    due = self._once(due)
         except BaseException as error:
             self._failure = error
 

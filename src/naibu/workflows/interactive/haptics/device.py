@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+import struct
+import sys
 import time
 from dataclasses import dataclass, field
 
@@ -10,12 +12,14 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_positive, require_within
 from naibu.core.errors import InputError
+from naibu.core.thread_priority import scheduled_first
 from naibu.simulation.haptics.haptic_loop import STALE
 from naibu.simulation.haptics.simulated_device import SimulatedDevice
 from naibu.workflows.interactive.haptics.endpoint import LOOPBACK
 from naibu.workflows.interactive.haptics.packets import FORCE, pose_bytes, read_force
 
 STEP_S = 1e-3
+STAMP, STAMPED = struct.Struct("@ll"), 35  # seconds and nanoseconds when a datagram came, and SO_TIMESTAMPNS of Linux
 BEHIND_S = 0.01  # a delay that the device does not catch up with, shorter than after which it lets go
 
 
@@ -41,6 +45,11 @@ class DeviceRecord:
         Most of it at any time, mN mm.
     sent, overtaken : int
         Poses sent, and answers that were dropped: a later one had come, or the device had let go.
+    arrived_s : ndarray, shape (b,)
+        When answers reached this machine's side of the line, lost ones among them, s: as the system tells it (Linux), whenever the device
+        reads them; elsewhere when they were read.
+    late_s : ndarray, shape (sent,)
+        By how much the device itself was late to send each pose, s.
     """
 
     heard_s: FloatArray
@@ -52,11 +61,18 @@ class DeviceRecord:
     most_work: float
     sent: int
     overtaken: int
+    arrived_s: FloatArray
+    late_s: FloatArray
 
     @property
     def gaps_s(self) -> FloatArray:
         """Times between answers (a - 1,), s."""
         return np.diff(self.heard_s)
+
+    @property
+    def arrival_gaps_s(self) -> FloatArray:
+        """Times between arrivals (b - 1,), s: pauses of the simulation, not of the device."""
+        return np.diff(np.sort(self.arrived_s))
 
     @property
     def stale(self) -> BoolArray:
@@ -111,21 +127,25 @@ def drive_live_simulation(
     require_within("reordering", reordering, 0.0, 1.0)
     up, down = (_Line(np.random.default_rng([seed, k]), loss, reordering) for k in range(2))
     heard: list[tuple[float, float, int, FloatArray, float]] = []
-    sent, overtaken, most = 0, 0, 0.0
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+    arrived, late, overtaken, most = [], [], 0, 0.0
+    with scheduled_first(), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
         line.connect((LOOPBACK, port))
+        if sys.platform == "linux":
+            line.setsockopt(socket.SOL_SOCKET, STAMPED, 1)
         began = due = time.perf_counter()
         left: dict[int, float] = {}
         while due - began < duration_s:
             pose = device.advance(STEP_S)
             most = max(most, device.work)
-            left[pose.sequence] = time.perf_counter()
+            left[pose.sequence] = now = time.perf_counter()
             left.pop(pose.sequence - 2000, None)
+            late.append(max(now - due, 0.0))
             for out in up.passed(pose_bytes(pose)):
                 _sent(line, out)
-            sent += 1
             due = max(due + STEP_S, time.perf_counter() - BEHIND_S)
-            while (packet := _received(line, due)) is not None:
+            while (found := _received(line, due)) is not None:
+                packet, came = found
+                arrived.append(came - began)
                 for each in down.passed(packet):
                     answer = read_force(each)
                     now, before = time.perf_counter(), device.force
@@ -137,7 +157,7 @@ def drive_live_simulation(
     if not heard:
         raise InputError(f"no answer came from port {port}; start naibu live with that port for haptic devices first")
     times, delays, flags, forces, steps = (np.array(values) for values in zip(*heard, strict=True))
-    return DeviceRecord(times, forces, steps, delays, flags, device.work, most, sent, overtaken)
+    return DeviceRecord(times, forces, steps, delays, flags, device.work, most, len(late), overtaken, np.array(arrived), np.array(late))
 
 
 def _sent(line: socket.socket, packet: bytes) -> None:
@@ -147,16 +167,29 @@ def _sent(line: socket.socket, packet: bytes) -> None:
         return
 
 
-def _received(line: socket.socket, due: float) -> bytes | None:
-    """Return the next datagram that has come or comes before a time, s, None when there is none."""
+def _received(line: socket.socket, due: float) -> tuple[bytes, float] | None:
+    """Return the next datagram that has come or comes before a time, s, and when it came; None when there is none."""
     while True:
         wait = max(due - time.perf_counter(), 0.0)
         line.settimeout(wait)
         try:
-            return line.recv(FORCE.size + 1)
+            return _read(line)
         except (TimeoutError, BlockingIOError):
             return None
         except OSError:  # nobody listens yet
             if wait == 0.0:
                 return None
             time.sleep(min(STEP_S, wait))
+
+
+def _read(line: socket.socket) -> tuple[bytes, float]:
+    """Return a datagram, and when it came on the clock of `time.perf_counter`, s."""
+    if sys.platform != "linux":
+        return line.recv(FORCE.size + 1), time.perf_counter()
+    packet, told, _, _ = line.recvmsg(FORCE.size + 1, socket.CMSG_SPACE(STAMP.size))
+    now, age = time.perf_counter(), 0.0
+    for level, kind, data in told:
+        if (level, kind) == (socket.SOL_SOCKET, STAMPED):
+            seconds, nanoseconds = STAMP.unpack(data)
+            age = max(time.time() - seconds - 1e-9 * nanoseconds, 0.0)
+    return packet, now - age

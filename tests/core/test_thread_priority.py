@@ -1,0 +1,48 @@
+"""A thread is scheduled first within a context, and only that thread."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+
+import pytest
+
+from naibu.core import thread_priority
+from naibu.core.thread_priority import scheduled_first
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems keep their schedule")
+
+
+def policy() -> int:
+    return os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK
+
+
+def test_the_system_says_so_within_the_context_and_not_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thread_priority, "usable_cores", lambda: 2)
+    before, started = policy(), []
+    with scheduled_first() as permitted:
+        assert policy() == (os.SCHED_RR if permitted else before)
+        other = threading.Thread(target=lambda: started.append(policy()))
+        other.start()
+        other.join()
+    assert policy() == before
+    assert started == [os.SCHED_OTHER]
+
+
+def test_one_core_is_left_to_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(thread_priority, "usable_cores", lambda: 1)
+    before = policy()
+    with scheduled_first() as permitted:
+        assert not permitted
+        assert policy() == before
+
+
+def test_what_the_system_refuses_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError("Operation not permitted")
+
+    monkeypatch.setattr(thread_priority, "usable_cores", lambda: 2)
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    with scheduled_first() as permitted:
+        assert not permitted
