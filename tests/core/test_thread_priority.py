@@ -46,3 +46,20 @@ def test_what_the_system_refuses_is_done_without(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
     with scheduled_first() as permitted:
         assert not permitted
+
+
+def test_users_without_the_rights_of_the_superuser_get_their_schedule_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    state = [os.SCHED_OTHER]
+
+    def permitted_but_for_the_flag(_: int, wanted: int, __: object) -> None:  # sched_setscheduler(2): EPERM
+        if state[0] & os.SCHED_RESET_ON_FORK and not wanted & os.SCHED_RESET_ON_FORK:
+            raise PermissionError("Operation not permitted")
+        state[0] = wanted
+
+    monkeypatch.setattr(thread_priority, "usable_cores", lambda: 2)
+    monkeypatch.setattr(os, "sched_getscheduler", lambda _: state[0])
+    monkeypatch.setattr(os, "sched_setscheduler", permitted_but_for_the_flag)
+    with scheduled_first() as permitted:
+        assert permitted
+        assert policy() == os.SCHED_RR
+    assert policy() == os.SCHED_OTHER

@@ -35,5 +35,5 @@ def scheduled_first() -> Iterator[bool]:
         return
     try:
         yield True
-    finally:
-        os.sched_setscheduler(0, policy, priority)
+    finally:  # with the flag, which only the superuser may take away
+        os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, priority)
