@@ -93,6 +93,29 @@ def test_what_nothing_determines_is_null_in_the_file_of_numbers(folder: Path, mo
     assert zone["95 % from"] == 0.0 and zone["to"] is None and (zone["of which 95 % from"], zone["up to"]) == (-1.0, 0.5)
 
 
+def test_volumes_hold_no_number_where_none_is_determined(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The best fit of what the measurement leaves open was there, to be averaged over a segment as if it had been measured."""
+
+    def uncertain(sd: float, of_ratio: float) -> dict[str, Volume]:
+        def identified(*of: Any, **options: Any) -> FieldEstimate:
+            return replace(identify_field(*of, **options), uncertainty=Uncertainty(np.eye(2), np.diag([sd, of_ratio]) ** 2))
+
+        monkeypatch.setattr(f"{ScannedObject.__module__}.identify_field", identified)
+        options = {"zones": folder / "labels.mha", "known": ["label 2=10 kPa, 0.4"], "element_size_mm": 10.0, "law": "linear"}
+        run = identify_fields(folder / "field.h5", out=folder / "out", overwrite=True, **options)  # type: ignore[arg-type]
+        return {p.stem: read_volume(p, missing=True) for p in run.files if p.suffix == ".mha"}
+
+    labels = read_volume(folder / "labels.mha").values
+    gel, pad = labels == 1, labels == 2
+    names = ("young_modulus", "young_modulus_sd", "poisson_ratio")
+    for sd, of_ratio, expected in ((1.5, 0.2, (0, 0, 0)), (0.1, 0.2, (1, 1, 1)), (0.1, 9.0, (1, 1, 0))):
+        found = uncertain(sd, of_ratio)
+        there = [np.isfinite(found[name].values[gel]) for name in names]
+        assert [bool(one.any()) for one in there] == [bool(one.all()) for one in there] == [bool(e) for e in expected]
+        assert all(np.isfinite(found[name].values[~gel]).all() and not found[name].values[labels == 0].any() for name in names)
+        assert found["young_modulus"].values[pad] == pytest.approx(10.0) and (found["zones"].values[gel] == 1).all()
+
+
 def test_what_the_other_law_would_give_stands_next_to_the_moduli(folder: Path) -> None:
     """To first order what the other law gives when it is used: within four tenths of the difference."""
     options = {"zones": folder / "labels.mha", "known": ["label 2=10 kPa, 0.4"], "element_size_mm": 10.0}

@@ -10,7 +10,7 @@ from lattice_studies import study_file
 
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
-from naibu.io.images import write_volume
+from naibu.io.images import read_volume, write_volume
 from naibu.mechanics.lattices.model.elastic_springs import elastic_stiffness
 from naibu.workflows.studies.calibrate import calibrate_study
 from naibu.workflows.studies.lattice_study import prepared_study
@@ -103,6 +103,13 @@ def test_moduli_that_cannot_be_are_told(tmp_path: Path, scanned: np.ndarray, mod
 def test_a_map_that_does_not_cover_the_object_is_refused(tmp_path: Path, scanned: np.ndarray) -> None:
     small = Volume.from_array(np.full((4, 4, 4), 9.0), spacing_mm=(2.0, 2.0, 2.0), origin_mm=(500.0, 0.0, 0.0))
     write_volume(tmp_path / "young_modulus.mha", small)
+    with pytest.raises(InputError, match="8 of 8 cubes of the object no positive modulus"):
+        prepared_study(study_file(tmp_path, STUDY.format(modulus='"young_modulus.mha"')))
+
+
+def test_a_map_that_leaves_a_modulus_open_gives_no_lattice(tmp_path: Path, scanned: np.ndarray) -> None:
+    there = read_volume(tmp_path / "young_modulus.mha")
+    write_volume(tmp_path / "young_modulus.mha", there.with_values(np.full(there.shape, np.nan)))
     with pytest.raises(InputError, match="8 of 8 cubes of the object no positive modulus"):
         prepared_study(study_file(tmp_path, STUDY.format(modulus='"young_modulus.mha"')))
 

@@ -23,7 +23,7 @@ PROBES = 24
 UNBOUNDED = 1e3  # a factor between estimate and bound beyond which the data give no bound
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
 POISSON_POORLY = 0.1
-NOT_DETERMINED = "not determined"
+NOT_DETERMINED, NOT_USABLE = "not determined", "not to be used"
 EXACT = 1e-9  # standard deviation of a logarithm that is rounding: that of the modulus whose multiples the others are
 UNIT = "the unit of the others"
 MESH_DEPENDENT = "not determined (depends on the mesh)"
@@ -216,7 +216,7 @@ def grade(of_young: float, *, usable: bool, sure: bool, apart: bool) -> str:
     if not np.isfinite(of_young):
         return NOT_DETERMINED
     if not usable:
-        return "not to be used"
+        return NOT_USABLE
     if of_young < EXACT:
         return UNIT
     if apart:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from naibu._version import __version__
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
@@ -27,7 +27,7 @@ from naibu.identification.from_fields.forward.sensitivities import young_and_poi
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.regions.relative_map import identify_relative_map
-from naibu.identification.from_fields.uncertainty import MESH_DEPENDENT, NOT_DETERMINED, Uncertainty, grade
+from naibu.identification.from_fields.uncertainty import MESH_DEPENDENT, NOT_DETERMINED, NOT_USABLE, POISSON_POORLY, Uncertainty, grade
 from naibu.identification.verdict import Explanation
 from naibu.io.displacement_fields import read_field
 from naibu.io.files.atomic import write_atomically
@@ -170,8 +170,9 @@ def identify_fields(
         From node to node along x, y, z, in voxels, of TIFF files of SPAM.
     out : path-like, optional
         Folder for ``model.json``, which predicts and can be touched; ``young_modulus.mha``, ``young_modulus_sd.mha`` and
-        ``poisson_ratio.mha`` on the grid of the mask (0 outside; -1 where there is no standard deviation); ``zones.mha`` (from 1 in the
-        order of the table of moduli, 0 where they are known); ``identification.json`` and ``report.html``.
+        ``poisson_ratio.mha`` on the grid of the mask (0 outside; not a number, NaN, where the value is not determined or not to be used,
+        or has no standard deviation); ``zones.mha`` (from 1 in the order of the table of moduli, 0 where they are known);
+        ``identification.json`` and ``report.html``.
     overwrite : bool
         Whether these files may be there already.
     progress : callable, optional
@@ -340,16 +341,28 @@ def _as_records(table: Table) -> list[dict[str, Cell]]:
     return [dict(zip(table.columns, row, strict=True)) for row in table.rows]
 
 
+def without_value(found: FieldEstimate, uncertainty: Uncertainty) -> tuple[BoolArray, BoolArray]:
+    """Return of which zones Young's modulus, and Poisson's ratio (count,), is no result: its best fit may be anything.
+
+    A volume is seen without the sentences that say so, and the mean over a part of it would hide such a number among others.
+    """
+    young = np.isin(_grades(found, uncertainty), (NOT_DETERMINED, MESH_DEPENDENT, NOT_USABLE))
+    return young, young | ~(uncertainty.of_young_and_poisson(found.theta)[1] <= POISSON_POORLY)
+
+
 def _volumes(result: FieldIdentification) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return Young's modulus, its standard deviation (NaN where there is none), and Poisson's ratio of every voxel; 0 outside."""
+    """Return Young's modulus, its standard deviation, and Poisson's ratio of every voxel; NaN where there is none, 0 outside."""
     found, cells = result.estimate, result.cell_of_voxel
     young, sd, poisson = (np.where(cells >= 0, values[cells], 0.0) for values in moduli_of_cells(found))
-    if found.borders is not None and found.uncertainty is not None:
-        regions = zones_of_voxels(found, result.scan, cells)
-        there = regions != KNOWN
-        of_young = found.young_modulus * found.uncertainty.of_young_and_poisson(found.theta)[0]
-        for full, values in ((young, found.young_modulus), (sd, of_young), (poisson, found.poisson_ratio)):
-            full[there] = values[regions[there]]
+    if found.uncertainty is None:
+        return young, sd, poisson
+    regions = zones_of_voxels(found, result.scan, cells)
+    there = regions != KNOWN
+    of_young = found.young_modulus * found.uncertainty.of_young_and_poisson(found.theta)[0]
+    no_young, no_poisson = without_value(found, found.uncertainty)
+    of_zones = (young, found.young_modulus, no_young), (sd, of_young, no_young), (poisson, found.poisson_ratio, no_poisson)
+    for full, values, none in of_zones:
+        full[there] = np.where(none, np.nan, values)[regions[there]]
     return young, sd, poisson
 
 
@@ -385,7 +398,7 @@ def _written(folder: Path, result: FieldIdentification) -> list[Path]:
     found, body, scan = result.estimate, result.body, result.scan
     young, sd, poisson = _volumes(result)
     regions = zones_of_voxels(found, scan, result.cell_of_voxel)
-    volumes = {"young_modulus": young, "young_modulus_sd": np.nan_to_num(sd, nan=-1.0, posinf=-1.0), "poisson_ratio": poisson}
+    volumes = {"young_modulus": young, "young_modulus_sd": sd, "poisson_ratio": poisson}
     files = [write_atomically(folder / "model.json", json.dumps(body.to_dict(), ensure_ascii=False, allow_nan=False) + "\n")]
     files += [write_volume(folder / f"{name}.mha", scan.with_values(v.astype(np.float32))) for name, v in volumes.items()]
     files.append(write_volume(folder / "zones.mha", scan.with_values((regions + 1).astype(np.uint16))))

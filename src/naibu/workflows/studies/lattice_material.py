@@ -76,7 +76,7 @@ def _moduli(path: Path, settings: StudyFile, lattice: Lattice) -> float | FloatA
 
 
 def _modulus_volume(path: Path, name: str) -> Volume:
-    volume = read_volume(file_beside(path, name))
+    volume = read_volume(file_beside(path, name), missing=True)  # a zone whose modulus was not determined
     values = np.asarray(volume.values, dtype=float)
     return volume.with_values(np.where(np.isfinite(values) & (values > 0.0), values, np.nan))
 
