@@ -9,6 +9,8 @@ from contextlib import contextmanager
 
 from naibu.core.cores import usable_cores
 
+REST_S = 6e-5  # least rest of a step of a thread that is scheduled first: Linux stops those that take more than 95 % of a core for 50 ms
+
 
 @contextmanager
 def scheduled_first() -> Iterator[bool]:

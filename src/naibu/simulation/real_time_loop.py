@@ -10,7 +10,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 from naibu.core.errors import NaibuError
-from naibu.core.thread_priority import scheduled_first
+from naibu.core.thread_priority import REST_S, scheduled_first
 from naibu.simulation.frame import Frame
 from naibu.simulation.haptics.haptic_loop import HapticHand, require_haptic_steps
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
@@ -159,9 +159,9 @@ class RealTimeLoop:
     def _once(self, due: float) -> float:
         """Make or show one frame when it is due, and return when the next one is."""
         wait = due - self.clock()
-        if wait > 0.0:
-            self.sleep(wait)
-        elif wait < -BEHIND_S:
+        if wait > 0.0 or self.hand is not None:
+            self.sleep(max(wait, REST_S))
+        if wait < -BEHIND_S:
             due = self.clock()
         pause = self.simulation.frame_s
         waits = self._paused or bool(self._replay)

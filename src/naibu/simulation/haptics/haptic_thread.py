@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Self
 
-from naibu.core.thread_priority import scheduled_first
+from naibu.core.thread_priority import REST_S, scheduled_first
 from naibu.simulation.haptics.haptic_loop import HapticHand
 from naibu.simulation.haptics.local_contact import LocalContact
 from naibu.simulation.interactive_simulation import InteractiveSimulation
@@ -59,9 +59,8 @@ class HapticThread:
                 due = self.clock()
                 while not self._stop.is_set():
                     wait = due - self.clock()
-                    if wait > 0.0:
-                        self.sleep(wait)
-                    elif wait < -BEHIND_S:
+                    self.sleep(max(wait, REST_S))
+                    if wait < -BEHIND_S:
                         due = self.clock()
                     self.step()
                     due += self.contact.frame_s

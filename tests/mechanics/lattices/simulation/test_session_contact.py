@@ -223,3 +223,44 @@ def test_bad_input_is_named(call: Callable[[], object], said: str) -> None:
     with pytest.raises(InputError) as caught:
         call()
     assert said in str(caught.value)
+
+
+@pytest.mark.parametrize("threads", [2, 3, 5])
+def test_steps_in_several_parts_are_those_in_one(threads: int) -> None:
+    """Balls over edges and the middle touch nodes of every part; the floor is held, so that its reactions are compared as well."""
+    places = ((2.0, 2.0), (28.0, 27.0), (15.0, 16.0))
+    balls = [spherical_indenter((*place, 38.1), 8.0, static_friction=0.4, kinetic_friction=0.3) for place in places]
+    motions = [IndenterVelocity((4.0, 3.0, -30.0)), IndenterVelocity((-4.0, 0.0, -20.0)), IndenterVelocity((0.0, 5.0, -40.0))]
+    found = []
+    for count in (1, threads):
+        made = engine(threads=count)
+        with made.session(constrained=BOTTOM, indenters=balls) as session:
+            steps = [session.step(motions=motions) for _ in range(30)]
+            steps.append(session.step(motions=motions, steps=20))
+            assert session.unsettled == 0
+            forces = np.concatenate([np.concatenate([each.indenters, each.bodies], axis=1) for each in steps])
+            found.append((session.positions(), forces))
+    assert (found[0][1][-1, :3, 2] < -10.0).all()
+    np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-6)
+    np.testing.assert_allclose(found[1][1], found[0][1], atol=1e-4 * np.abs(found[0][1]).max())
+
+
+def test_momentum_of_steps_in_parts_is_what_indenters_give() -> None:
+    made = engine(threads=3)
+    with made.session(indenters=[BALL]) as session:
+        forces = session.step(motions=[DOWN], steps=40).indenters
+        momentum = LATTICE.node_mass @ session.state().velocity
+    np.testing.assert_allclose(momentum, made.step * forces.sum(axis=(0, 1)), atol=1e-3 * made.step * np.abs(forces).sum())
+
+
+def test_workers_come_back_after_a_session_is_closed_in_contact() -> None:
+    found = []
+    for close in (False, True):
+        session = engine(threads=2).session(constrained=BOTTOM, indenters=[BALL])
+        for _ in range(10):
+            session.step(motions=[DOWN])
+            if close:
+                session.close()
+        found.append(session.positions())
+        session.close()
+    np.testing.assert_array_equal(found[1], found[0])

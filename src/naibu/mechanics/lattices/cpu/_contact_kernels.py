@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
+from naibu._numba.thread_pool import begin_step, end_step
 from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off
 from naibu.mechanics.lattices.cpu._contact_multipliers import settle_multipliers, update_multipliers
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, close_operator
@@ -26,14 +27,15 @@ from naibu.mechanics.lattices.cpu._contact_solver import (
 )
 from naibu.mechanics.lattices.cpu._explicit_kernels import forces_of_elements
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, begin_with, follow_contacts
-from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import add_momenta, add_reactions, advance
+from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import SETUP, add_momenta, add_reactions, advance
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import residual_norm
-from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR
+from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR, POOL
 
 AGREED = 1e-4  # error of the pressures, as a fraction of their sum, at which a step is settled
 AGREED_FRICTION = 2e-3  # likewise of the friction, of the sum of its limits
 LOOSE = 5e-3  # tolerance from which on passes may be rough; with a tighter one, no early end is to decide which points slip
 STRICT = 0.1  # by which contacts agree more closely with a tighter tolerance
+PASS = 2  # work of a pass beside its iterations, in iterations
 ROUGHLY, ROUGH_PASSES = 0.3, 2  # reduction of the residual of a pass whose contacts may be far from those of the solution, and how many
 
 
@@ -163,7 +165,9 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
     iterations, passes, unsettled = 0, 0, 0
     room = new_room()
     begin_with(inner, now)
+    control = inner[POOL][0]
     for n in range(len(velocity)):
+        begin_step(control)
         if len(extension):
             forces_of_elements(blocks, tables, (x, v, extension), applied, external)
         for i in range(len(v)):
@@ -197,5 +201,6 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
         keep(count, indenters, surface, history, lists, slid, points[1], reactions[1][n])
         update_multipliers(count, indenters[4], surface, history, lists, points[1], nodal, covered, together)
         advance(data, lost)
+        end_step(control, done + PASS * tries + SETUP)
     operator[5][FACES], operator[5][NODES] = 0, 0
     return iterations, passes, unsettled

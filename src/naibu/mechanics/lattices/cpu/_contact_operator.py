@@ -29,10 +29,11 @@ def new_operator(faces: int, nodes: int) -> Operator:
 
 
 @njit(cache=True, fastmath={"contract", "nsz"}, **UNCOUNTED)
-def add_contact(corners, blocks, count, sign, p, q, room):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add to q (3 pad,) `sign` times what the blocks of `count` faces give for p, and return p times that; `room` (16,) is scratch.
+def add_contact(corners, blocks, count, sign, p, rows, nodes, room):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add `sign` times what the blocks of `count` faces give for p (3 pad,), and return p times that; `room` (16,) is scratch.
 
-    Blocks are symmetric: their rows are taken for columns, eight numbers at a time.
+    It is added to the row of `rows` (parts, 3 pad) of the part that has a node; those of part c begin at `nodes[c]`. Blocks are symmetric:
+    their rows are taken for columns, eight numbers at a time.
     """
     pad, energy = len(p) // 3, p.dtype.type(0.0)
     factor = p.dtype.type(sign)
@@ -47,11 +48,13 @@ def add_contact(corners, blocks, count, sign, p, q, room):  # type: ignore[no-un
         store(room, 0, low)
         store(room, WIDTH, high)
         for k in range(4):
-            i = corners[f, k]
+            i, c = corners[f, k], 0
+            while c + 1 < len(rows) and i >= nodes[c + 1]:
+                c += 1
             for a in range(3):
                 s = room[3 * k + a]
                 energy += p[a * pad + i] * s
-                q[a * pad + i] += factor * s
+                rows[c, a * pad + i] += factor * s
     return sign * float(energy)
 
 

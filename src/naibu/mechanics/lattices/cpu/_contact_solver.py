@@ -1,4 +1,4 @@
-"""Velocities of a step in contact whose contacts change from pass to pass, by one thread.
+"""Velocities of a step in contact whose contacts change from pass to pass.
 
 A pass that may not be the last one ends early, with the residual that conjugate gradients in single precision carry along. The lattice
 is multiplied in double precision once, at the end: by what all passes changed.
@@ -12,8 +12,19 @@ from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, ROOM, ROUGH_ROOM, add_contact
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import CREDIT
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import first_residual, settle
-from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import conjugate_gradients, multiply, project, residual_norm
-from naibu.mechanics.lattices.cpu.implicit._solver_parts import ALIGN, MULTIPLY, NORM, OPERATOR, POOL, share
+from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import conjugate_gradients, project, residual_norm
+from naibu.mechanics.lattices.cpu.implicit._solver_parts import (
+    ALIGN,
+    CHANGE,
+    FURTHER,
+    MULTIPLY,
+    MULTIPLY_FULL,
+    NORM,
+    OPERATOR,
+    POOL,
+    collect,
+    share,
+)
 
 _FAST, _SUMS = {"contract", "nsz"}, {"contract", "nsz", "reassoc"}
 _ROUNDS = 8  # of conjugate gradients, at most, between which the residual is computed in double precision
@@ -42,7 +53,8 @@ def change_contacts(data, given, sign):  # type: ignore[no-untyped-def]  # pragm
         i = operator[3][c]
         for a in range(3):
             r[a * pad + i] += sign * given[a * pad + i]
-    add_contact(operator[0], operator[1], operator[5][FACES], -sign, v, r, operator[ROOM])
+    nodes = data[0][5][POOL][1][1]
+    add_contact(operator[0], operator[1], operator[5][FACES], -sign, v, r.reshape(1, len(r)), nodes, operator[ROOM])
 
 
 @njit(cache=True, **UNCOUNTED)
@@ -109,15 +121,15 @@ def solve_roughly(solver, goal, limit):  # type: ignore[no-untyped-def]  # pragm
 def solve_exactly(data, goal, limit, given, plain, origin):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Improve v until the square of the norm of its residual, in double precision, is below `goal`; returns the number of iterations."""
     solver = data[0]
-    blocks, tables, mass, v, (axes, r, p, q), _, _ = solver
+    v, (_, r, p, _), numbers = solver[3], solver[4], solver[5][POOL][5]
     count = 0
     for _ in range(_ROUNDS):
         count += solve_roughly(solver, goal, limit - count)
         for i in range(len(v)):
-            p[i] = v[i] - origin[i]
-        multiply(blocks, tables[5], axes, mass, p, q)
-        for i in range(len(r)):
-            r[i] = plain[i] - q[i]
+            p[i], r[i] = v[i] - origin[i], plain[i]
+        share(solver, MULTIPLY_FULL, 0.0)
+        numbers[FURTHER] = 0.0
+        share(solver, CHANGE, 1.0)
         change_contacts(data, given, 1.0)
         if count >= limit or not share(solver, NORM, 0.0) > goal:
             break
@@ -145,11 +157,18 @@ def settle_in_contact(data):  # type: ignore[no-untyped-def]  # pragma: no cover
 
 @njit(cache=True, **UNCOUNTED)
 def _product(solver):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Multiply p, in single precision, by the matrix, contacts included, and return p times that."""
+    """Multiply p, in single precision, by the matrix, contacts included, and return p times that; the product is in the first row."""
     inner = solver[5]
-    touched, along, product = inner[OPERATOR], inner[6], inner[POOL][3][0]
+    touched, along, (_, (_, nodes, high, _), _, rows, _, _) = inner[OPERATOR], inner[6], inner[POOL]
     curvature = share(solver, MULTIPLY, 0.0)
-    return curvature + add_contact(touched[0], touched[2], touched[5][FACES], 1.0, along, product, touched[ROUGH_ROOM])
+    curvature += add_contact(touched[0], touched[2], touched[5][FACES], 1.0, along, rows, nodes, touched[ROUGH_ROOM])
+    pad = len(along) // 3
+    for c in range(1, len(rows)):
+        collect(rows, nodes, high, c, pad)
+        for axis in range(3):
+            for i in range(axis * pad + nodes[c], axis * pad + nodes[c + 1]):
+                rows[0, i] = rows[c, i]
+    return curvature
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)

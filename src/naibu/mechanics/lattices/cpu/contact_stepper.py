@@ -9,7 +9,8 @@ from itertools import pairwise
 import numpy as np
 
 from naibu._numba.intrinsics.packed_tuples import packed
-from naibu.core.arrays import AnyArray, FloatArray
+from naibu._numba.thread_pool import STOP, start_workers, stop_workers
+from naibu.core.arrays import AnyArray, FloatArray, IntArray
 from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geometries
 from naibu.mechanics.contact.indenter_motion import SHARE, step_parts
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
@@ -21,8 +22,9 @@ from naibu.mechanics.lattices.cpu._contact_points import RESULTS, rest_at
 from naibu.mechanics.lattices.cpu.explicit_contact import ElementForces, no_elements
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, TOUCHED
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import COARSE, POOL
+from naibu.mechanics.lattices.cpu.implicit._step_parts import implicit_worker
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments
-from naibu.mechanics.lattices.cpu.stepper import MOST_ITERATIONS, ImplicitStepper
+from naibu.mechanics.lattices.cpu.stepper import IMPLICIT_CALL, MOST_ITERATIONS, ImplicitStepper, calls
 from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface
 
@@ -62,6 +64,8 @@ class ContactStepper:
         Returns a stepper of the same arrays whose steps are shorter by a whole number.
     forces : ElementForces
         Of the elements, where these are stepped explicitly; `base` then has the masses alone.
+    alone : bool
+        Whether no worker is asked in the next steps.
     points : tuple
         Nodes of the faces, inverse areas, shape functions and weights, and where those of each indenter begin.
     scratch : tuple
@@ -81,9 +85,10 @@ class ContactStepper:
     points: KernelTuple
     scratch: KernelTuple
     forces: ElementForces | None = None
+    alone: bool = False
     _fastest: FloatArray = field(init=False)  # (k,), mm/s, at which no indenter passes through the surface in a step
     _finer: dict[int, ImplicitStepper] = field(default_factory=dict)
-    _arguments: dict[int, tuple[KernelTuple, PackedArguments, PackedArguments]] = field(default_factory=dict)
+    _arguments: dict[int, tuple[KernelTuple, tuple[PackedArguments, FloatArray, IntArray, PackedArguments]]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._fastest = SHARE / self.base.step * np.array([p.geometry.inradius for p in self.indenters])
@@ -162,20 +167,22 @@ class ContactStepper:
         """Take steps of a stepper that shares the state."""
         for values in reactions:
             values[:] = 0.0
-        data, own = self._arguments_of(base, parts)
-        motion, limits = (held_velocity, velocity, spin), (base.tolerance, MOST_ITERATIONS)
-        found: tuple[int, int, int] = contact_steps(data, own, base.constrained[2], motion, limits, reactions, self.passes)
-        return found
+        limits, found = (base.tolerance, MOST_ITERATIONS), np.zeros(3, dtype=np.int64)
+        data, weight, control, own = self._arguments_of(base, parts)
+        for now in calls(control, self.alone, len(velocity), IMPLICIT_CALL):
+            start_workers(implicit_worker, control, data)
+            motion, given = (held_velocity[now], velocity[now], spin[now]), (reactions[0][now], reactions[1][now])
+            found += contact_steps(data, own, weight, motion, limits, given, self.passes)
+        return int(found[0]), int(found[1]), int(found[2])
 
-    def _arguments_of(self, base: ImplicitStepper, parts: int) -> tuple[PackedArguments, PackedArguments]:
-        """Return what the kernels read of a stepper that shares the state, and of the contact."""
+    def _arguments_of(self, base: ImplicitStepper, parts: int) -> tuple[PackedArguments, FloatArray, IntArray, PackedArguments]:
+        """Return what the kernels read of a stepper that shares the state: its data, weights, the control of workers, and the contact."""
         known = self._arguments.get(parts)
-        if known is None or known[0] is not base.constrained:
-            (node, direction, _, body), (operator, *own), contact = base.constrained, self.scratch, self.contact
+        if known is None or known[0] is not base.constrained or known[1][2][STOP]:
+            (operator, *own), contact = self.scratch, self.contact
             memory = base.scratch[1][COARSE][5][2]
-            if len(memory):  # a run does not depend on those before it
+            if len(memory) and (known is None or known[0] is not base.constrained):  # a run does not depend on those before it
                 memory[[TOUCHED, LATEST]] = 0
-            data = base.arguments(base.scratch[1][POOL], operator, (node, direction, np.zeros(len(node)), body))
             history = contact.history()
             corners, spread, *rest = self.points
             surface = (corners, spread, self.surface.foundation(base.step), *rest)
@@ -183,9 +190,22 @@ class ContactStepper:
             together = not self.surface.resists_at_once(base.step, base.mass)
             scratch = (*own, contact.covered, together, contact.acceleration, contact.lasting)
             elements = no_elements() if self.forces is None else self.forces.arguments(parts)
-            known = base.constrained, data, packed(self._shapes(), surface, history, scratch, vectors, elements)
+            read = packed(self._shapes(), surface, history, scratch, vectors, elements)
+            known = base.constrained, (*self._data_of(base, operator), read)
             self._arguments[parts] = known
-        return known[1], known[2]
+        return known[1]
+
+    def _data_of(self, base: ImplicitStepper, operator: KernelTuple) -> tuple[PackedArguments, FloatArray, IntArray]:
+        """Return the data of a stepper, its weights and the control of its workers; those that divide steps have none."""
+        if base is self.base:
+            return base.contact_arguments(operator)
+        (node, direction, weight, body), pool = base.constrained, base.scratch[1][POOL]
+        return base.arguments(pool, operator, (node, direction, np.zeros(len(node)), body)), weight, pool[0]
+
+    def close(self) -> None:
+        """Stop the workers, until the next step."""
+        for _, (_, _, control, _) in self._arguments.values():
+            stop_workers(control)
 
     def _shapes(self) -> KernelTuple:
         """Return the indenters as the kernels read them."""

@@ -62,7 +62,7 @@ class LatticeEngine:
     tolerance : float
         Of the implicit solver, relative to the residual that the old velocity leaves.
     threads : int
-        Threads of a step; in contact with indenters there is one.
+        Threads of a step.
     kernel : tuple
         What the kernels read: blocks and tables of coefficients; of explicit methods also the masses and the parts of the threads.
     mass : ndarray, shape (pad,)

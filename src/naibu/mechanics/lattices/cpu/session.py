@@ -178,6 +178,7 @@ class LatticeSession:
         if self._contact is not None:
             where = self._contact.contact.centres
             self._resting = tuple(p for p, centre in zip(self.indenters, where, strict=True) if np.array_equal(p.centre, centre))
+            self._contact.close()
         self._contact, self.indenters = None, ()
         if indenters:
             self._bring(indenters, None, self._resting)
@@ -278,6 +279,8 @@ class LatticeSession:
     def close(self) -> None:
         """Send the threads of the pool away, until the next step; the garbage collector does it as well."""
         self.stepper.close()
+        if self._contact is not None:
+            self._contact.close()
 
     def __enter__(self) -> LatticeSession:
         """Return the session."""
@@ -311,10 +314,14 @@ class LatticeSession:
         driven = [k for k, motion in enumerate(motions) if isinstance(motion, IndenterForce)]
         if len(driven) > 1:
             raise InputError(f"motions of the indenters {', '.join(map(str, driven))} are forces; one indenter can be driven by a force")
+        now = self.clock()
+        stepper.alone = now - self._ended > self._ended - self._began
+        self._began = now
         if driven:
             found = self._driven_steps(stepper, driven[0], motions[driven[0]], (path, spins), forces)
         else:
             found = stepper.advance(self._path, path, spins, (forces.bodies, forces.indenters))
+        self._ended = self.clock()
         for k, (centre, axes) in poses.items():
             contact.centres[k], contact.axes[k] = centre, axes
         self.speed = path[-1].copy()

@@ -19,7 +19,7 @@ from naibu.mechanics.lattices.cpu.implicit._step_parts import implicit_worker
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments, Scratch, new_sums
 
 MOST_ITERATIONS = 20_000
-_EXPLICIT_CALL, _IMPLICIT_CALL = 64, 8  # steps of a call of a kernel with workers
+_EXPLICIT_CALL, IMPLICIT_CALL = 64, 8  # steps of a call of a kernel with workers
 
 
 @dataclass(slots=True, eq=False)
@@ -91,7 +91,7 @@ class ExplicitStepper(Stepper):
         """Take steps and fill the reactions."""
         if self.control[STOP]:  # closed in between; workers may still be on their way out
             self.control = new_control(int(self.control[PARTS]))
-        for own in _calls(self.control, alone, len(velocity), _EXPLICIT_CALL):
+        for own in calls(self.control, alone, len(velocity), _EXPLICIT_CALL):
             start_workers(explicit_worker, self.control, self.data)
             explicit_steps(self.control, self.data, velocity[own], reaction[own])
         return 0, 0
@@ -150,6 +150,11 @@ class ImplicitStepper(Stepper):
         solver = (blocks, tables, self.mass, self.velocity, work, (*inner[:OPERATOR], operator, pool), entries)
         return packed(solver, (self.position, self.extension, self.length, before, right, self.external, self.step))
 
+    def contact_arguments(self, operator: KernelTuple) -> tuple[PackedArguments, FloatArray, IntArray]:
+        """Return what kernels of steps in contact read, the weights of what is constrained, and the control of workers of their own."""
+        control = new_control(int(self.control[PARTS]))
+        return self.arguments((control, *self._pool[1:]), operator, self._entries), self._weight, control
+
     def advance(self, velocity: FloatArray, reaction: FloatArray, *, alone: bool = False) -> tuple[int, int]:
         """Take steps and fill the reactions."""
         reaction[:] = 0.0
@@ -158,7 +163,7 @@ class ImplicitStepper(Stepper):
             self.control = new_control(int(self.control[PARTS]))
             self._pool = (self.control, *self._pool[1:])
             self.data = self.arguments(self._pool, self.scratch[1][OPERATOR], self._entries)
-        for own in _calls(self.control, alone, len(velocity), _IMPLICIT_CALL):
+        for own in calls(self.control, alone, len(velocity), IMPLICIT_CALL):
             start_workers(implicit_worker, self.control, self.data)
             found += implicit_steps(self.data, self._weight, velocity[own], limits, reaction[own])
         return int(found[0]), int(found[1])
@@ -168,7 +173,7 @@ class ImplicitStepper(Stepper):
         stop_workers(self.control)
 
 
-def _calls(control: IntArray, alone: bool, steps: int, most: int) -> Iterator[slice]:
+def calls(control: IntArray, alone: bool, steps: int, most: int) -> Iterator[slice]:
     """Divide steps into calls of a kernel, between which workers can begin."""
     control[IDLE] = alone
     size = steps if alone or control[PARTS] == 1 else most

@@ -27,7 +27,7 @@ from naibu.mechanics.lattices.cpu.implicit._solver_parts import ALIGN, CHANGE, F
 from naibu.mechanics.lattices.cpu.implicit._step_parts import CONSTRAIN, EXTEND, LIMIT, MOVE, PREPARE, START, share_step
 
 _FAST = {"contract", "nsz"}
-_SETUP = 6  # work of a step beside its iterations, in iterations
+SETUP = 6  # work of a step beside its iterations, in iterations
 
 
 @njit(cache=True, **COUNTED)
@@ -82,7 +82,7 @@ def settle(data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """
     solver, x = data[0], data[1][0]
     _, _, mass, v, (_, r, p, q), inner, constrained = solver
-    touched, (_, _, full, _, _, numbers) = inner[OPERATOR], inner[POOL]
+    touched, (_, parts, full, _, _, numbers) = inner[OPERATOR], inner[POOL]
     pad = len(mass)
     free = len(constrained[0]) == 0 and touched[5][FACES] == 0
     if free:
@@ -101,7 +101,7 @@ def settle(data):  # type: ignore[no-untyped-def]  # pragma: no cover
             p[i] = v[i] - q[i]
         lost = dot(p, r)
     curvature = share(solver, MULTIPLY_FULL, 0.0)
-    curvature += add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, full[0], touched[ROOM])
+    curvature += add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, full, parts[1], touched[ROOM])
     fraction = lost / curvature if curvature > 0.0 else 0.0
     numbers[FURTHER] = fraction
     share(solver, CHANGE, fraction)
@@ -124,13 +124,13 @@ def first_residual(data):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Constrain v and set r to its residual; return the square of the norm below which rounding rules."""
     solver = data[0]
     v, r, inner, constrained = solver[3], solver[4][1], solver[5], solver[6]
-    touched, sums = inner[OPERATOR], inner[POOL][4]
+    touched, (_, parts, _, _, sums, _) = inner[OPERATOR], inner[POOL]
     follow(inner[8], inner[3], constrained, False)
     share_step(data, CONSTRAIN, 0.0)
     heaviest = 0.0
     for c in range(len(sums)):
         heaviest = max(heaviest, sums[c, 0])
-    add_contact(touched[0], touched[1], touched[5][FACES], -1.0, v, r, touched[ROOM])
+    add_contact(touched[0], touched[1], touched[5][FACES], -1.0, v, r.reshape(1, len(r)), parts[1], touched[ROOM])
     share_step(data, PREPARE, 0.0)
     strength = summed(sums, 0)
     inner[POOL][5][FURTHER] = 0.0
@@ -213,5 +213,5 @@ def implicit_steps(data, weight, velocity, limits, reaction):  # type: ignore[no
         add_reactions(now, r, len(mass), step, reaction[n])
         checked += advance(data, lost)
         iterations += count
-        end_step(control, count + _SETUP)
+        end_step(control, count + SETUP)
     return iterations, checked

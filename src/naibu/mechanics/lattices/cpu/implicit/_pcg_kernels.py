@@ -91,7 +91,7 @@ def conjugate_gradients(solver, unit, goal, limit, helped):  # type: ignore[no-u
             project(constrained, p, pad)
         curvature = share(solver, MULTIPLY, 0.0)
         if counts[FACES]:
-            curvature += add_contact(corners, rough, counts[FACES], 1.0, p, pool[3][0], room)
+            curvature += add_contact(corners, rough, counts[FACES], 1.0, p, pool[3], pool[1][1], room)
         if not curvature > 0.0:
             return count, False
         norm = share(solver, DESCEND, energy / curvature)
@@ -106,7 +106,7 @@ def solve(solver, goal, limit):  # type: ignore[no-untyped-def]  # pragma: no co
     It stops where the square of the residual's norm is below `goal`. Returns the number of iterations.
     """
     p, inner = solver[4][2], solver[5]
-    coarse, touched, full = inner[8], inner[OPERATOR], inner[POOL][2]
+    coarse, touched, (_, parts, full, _, _, _) = inner[8], inner[OPERATOR], inner[POOL]
     norm = share(solver, NORM, 0.0)
     count, helped = 0, len(coarse[5][2]) > 0
     for _ in range(8):
@@ -117,7 +117,7 @@ def solve(solver, goal, limit):  # type: ignore[no-untyped-def]  # pragma: no co
         count, helped = count + done, helped and well
         share(solver, CORRECT, unit)
         share(solver, MULTIPLY_FULL, 0.0)
-        add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, full[0], touched[ROOM])
+        add_contact(touched[0], touched[1], touched[5][FACES], 1.0, p, full, parts[1], touched[ROOM])
         inner[POOL][5][FURTHER] = 0.0
         share(solver, CHANGE, 1.0)
         norm = share(solver, NORM, 0.0)
