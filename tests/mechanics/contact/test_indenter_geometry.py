@@ -8,6 +8,7 @@ import pytest
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.core.rigid_transform import rotation_matrix
+from naibu.mechanics.contact._geometry_kernels import distance_from_turned_block
 from naibu.mechanics.contact.indenter_geometry import (
     IndenterGeometry,
     bar_geometry,
@@ -57,6 +58,21 @@ def test_derivatives_are_those_of_the_distance(name: str) -> None:
     clear = smooth & (np.abs(gap) > 0.05)
     np.testing.assert_allclose(second[clear], (turned[0] - turned[1])[clear] / (2.0 * step), atol=2e-3)
     assert (gap < 0.0).any() and (gap > 0.0).any()
+
+
+@pytest.mark.parametrize("name", ["plane", "box"])
+def test_kernels_that_take_numbers_give_the_closed_form(name: str) -> None:
+    """The distance from a half space is the height; from a box that of what is beyond its faces, or the depth below the nearest one."""
+    shape = SHAPES[name]
+    points = np.random.default_rng(3).uniform(-5.0, 5.0, (400, 3))
+    own, axes, half = points @ shape.axes.T, tuple(shape.axes.ravel()), tuple(np.resize(shape.size, 3))
+    beyond = np.abs(own) - half
+    gap = own[:, 2] if name == "plane" else np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(axis=1), 0.0)
+    found = np.array([distance_from_turned_block(shape.kind, half, axes, *point) for point in points])
+    np.testing.assert_allclose(found[:, 0], gap, atol=1e-12)
+    ahead = np.array([distance_from_turned_block(shape.kind, half, axes, *point)[0] for point in points + 1e-6 * found[:, 1:]])
+    np.testing.assert_allclose(np.linalg.norm(found[:, 1:], axis=1), 1.0, rtol=1e-12)
+    np.testing.assert_allclose((ahead - gap) / 1e-6, 1.0, atol=1e-6)  # no other direction than the normal goes away as fast
 
 
 @pytest.mark.parametrize("name", [name for name in SHAPES if name != "plane" and not name.startswith("bar")])

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 from naibu.mechanics.contact._triangle_kernels import STACK, closest_point
 
 PLANE, BOX, CYLINDER, SPHERE, CAPSULE, BAR, MESH = range(7)
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def signed_distance(kind, size, mesh, q, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the signed distance of q from a shape; see the module for n and h, `packed_geometries` for `size` and `mesh`."""
     if kind == MESH:
@@ -25,7 +25,7 @@ def signed_distance(kind, size, mesh, q, n, h):  # type: ignore[no-untyped-def] 
     return distance_from_primitive(kind, size, q, n, h)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def distance_from_primitive(kind, size, q, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the signed distance of q from a shape without a mesh, as `signed_distance` does."""
     n[0], n[1], n[2] = 0.0, 0.0, 0.0
@@ -47,7 +47,7 @@ def distance_from_primitive(kind, size, q, n, h):  # type: ignore[no-untyped-def
     return _from_bar(q, size, n, h)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _from_centre(x, y, z, radius, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     r = np.sqrt(x**2 + y**2 + z**2)
     n[0], n[1], n[2] = x, y, z
@@ -60,7 +60,7 @@ def _from_centre(x, y, z, radius, n, h):  # type: ignore[no-untyped-def]  # prag
     return r - radius
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _from_axis(q, radius, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     r = np.sqrt(q[0] ** 2 + q[1] ** 2)
     n[0], n[1] = (q[0] / r, q[1] / r) if r > 0.0 else (1.0, 0.0)
@@ -68,7 +68,7 @@ def _from_axis(q, radius, n, h):  # type: ignore[no-untyped-def]  # pragma: no c
     return r - radius
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _add_hoop(x, y, slope, r, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add the second derivative around an axis: `slope` is the radial component of the gradient, (x, y) the radial direction."""
     if len(h) and r > 0.0:
@@ -78,14 +78,14 @@ def _add_hoop(x, y, slope, r, h):  # type: ignore[no-untyped-def]  # pragma: no 
         h[1, 0] -= slope * x * y / r
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def box_distance(q, size, n):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the distance of q from a box of half edges `size`, and set its normal n."""
     gap, n[0], n[1], n[2] = distance_and_normal_of_box(q[0], q[1], q[2], size[0], size[1], size[2])
     return gap
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def distance_and_normal_of_box(x, y, z, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the distance of a point from a box of half edges a, b and c, and its normal: numbers are handed over faster than arrays."""
     over_x, over_y, over_z = abs(x) - a, abs(y) - b, abs(z) - c
@@ -101,7 +101,7 @@ def distance_and_normal_of_box(x, y, z, a, b, c):  # type: ignore[no-untyped-def
     return over_z, 0.0, 0.0, sz
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _from_box(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     gap = box_distance(q, size, n)
     if len(h) and gap > 0.0:
@@ -111,7 +111,31 @@ def _from_box(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no cove
     return gap
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
+def distance_from_turned_block(kind, half, axes, x, y, z):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the signed distance of a point from a plane or a box, and its outward normal.
+
+    `half` are the half edges of the box, `axes` the nine components of the axes of the shape, row by row. Kernels that look at many points
+    need no arrays for it, which take longer to hand over than to compute with.
+    """
+    a, b, c, d, e, f, g, h, i = axes
+    if kind == PLANE:
+        return g * x + h * y + i * z, g, h, i
+    gap, u, v, w = distance_and_normal_of_box(
+        a * x + b * y + c * z, d * x + e * y + f * z, g * x + h * y + i * z, half[0], half[1], half[2]
+    )
+    return gap, a * u + d * v + g * w, b * u + e * v + h * w, c * u + f * v + i * w
+
+
+@njit(cache=True, **UNCOUNTED)
+def gap_of_sphere(radius, d, n):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the signed distance of a point at d (3,) from the centre of a sphere, and set its outward normal n (3,)."""
+    r = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    n[0], n[1], n[2] = (d[0] / r, d[1] / r, d[2] / r) if r > 0.0 else (0.0, 0.0, 1.0)
+    return r - radius
+
+
+@njit(cache=True, **UNCOUNTED)
 def _from_cylinder(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     r = np.sqrt(q[0] ** 2 + q[1] ** 2)
     outward, upward = r - size[0], abs(q[2]) - size[1]
@@ -128,7 +152,7 @@ def _from_cylinder(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no
     n[2] = axial if q[2] >= 0.0 else -axial
     if len(h):
         if gap > 0.0 and radial != 0.0 and axial != 0.0:  # the rim: a circle, seen in the plane of the axis
-            e = np.array([x, y, 0.0])
+            e = (x, y, 0.0)
             for a in range(3):
                 for b in range(3):
                     h[a, b] = (e[a] * e[b] + (1.0 if a == 2 and b == 2 else 0.0) - n[a] * n[b]) / gap
@@ -136,7 +160,7 @@ def _from_cylinder(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no
     return gap
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _from_bar(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     """A bar without end along y, its face at z = 0, of half width size[0], with edges rounded by size[1]; it fills z < 0."""
     radius = size[1]
@@ -156,7 +180,7 @@ def _from_bar(q, size, n, h):  # type: ignore[no-untyped-def]  # pragma: no cove
     return d2 - radius
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def _from_mesh(q, mesh, n, h):  # type: ignore[no-untyped-def]  # pragma: no cover
     vertices, triangles, order, start, boxes = mesh
     stack = np.empty(STACK, dtype=np.int64)

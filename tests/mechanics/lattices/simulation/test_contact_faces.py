@@ -20,7 +20,7 @@ from naibu.mechanics.contact.rigid_indenters import (
     plane_indenter,
     spherical_indenter,
 )
-from naibu.mechanics.lattices.cpu._contact_points import _covered
+from naibu.mechanics.lattices.cpu._contact_cells import covered
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import CLASSES, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
@@ -76,7 +76,7 @@ def test_cells_of_faces_add_up_to_the_volume_of_the_cap_that_a_sphere_has_below_
     for place in np.random.default_rng(2).uniform(0.0, edge, (20, 2)):
         away = np.linalg.norm(at - [*place, height], axis=1)
         slope = np.linalg.norm(at[:, :2] - place, axis=1) / away
-        mean = [_covered(d, s, np.sqrt(w), 1.0 / radius)[0] for d, s, w in zip(radius - away, slope, weight.ravel(), strict=True)]
+        mean = [covered(d, s, np.sqrt(w), 1.0 / radius)[0] for d, s, w in zip(radius - away, slope, weight.ravel(), strict=True)]
         assert weight.ravel() @ mean == pytest.approx(exact, rel=within)
 
 

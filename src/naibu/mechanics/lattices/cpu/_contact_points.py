@@ -17,7 +17,18 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
-from naibu.mechanics.contact._geometry_kernels import MESH, SPHERE, distance_from_primitive, mesh_of, signed_distance
+from naibu.mechanics.contact._geometry_kernels import (
+    BOX,
+    MESH,
+    PLANE,
+    SPHERE,
+    distance_from_primitive,
+    distance_from_turned_block,
+    gap_of_sphere,
+    mesh_of,
+    signed_distance,
+)
+from naibu.mechanics.lattices.cpu._contact_cells import covered, facing, is_far, pressed
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
@@ -25,14 +36,8 @@ TANGENTIAL = 16.7  # stiffness of a point before it slips, of a foundation one e
 MARGIN = 0.25  # of the radius of a face, by which it may be off what was foreseen
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
-LEAST_SLOPE = 1e-3  # of a gap over a cell
-LEAST_FACING = 0.01
-# of the width of a cell times what the slope changes by over it: mean gap over that at the point, beside the lowest point of an indenter;
-# and by how much earlier a cell begins to be covered than it is, so that it is not so at once
-BESIDE, EARLY = 1.0 / 24.0, 1.0 / 16.0
 STRAIGHT = 0.5  # cosine of the angle between the frictions of two passes below which a point turns
 NEAR = 0.1  # of the width of a cell that looks at a flat indenter: it has what is as near as that
-UPRIGHT = 0.75  # width of the cells of a face that stands upright on an indenter: Gauss points lie nearer to its edge than they are wide
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
 # velocity of the indenter, covered fraction of the cell, unit vector of friction that slides, drag missing along it, whether that turned
 NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, ALIGNED, SLACK, TURNED, COLUMNS = 0, 3, 4, 7, 8, 9, 12, 13, 16, 17, 18
@@ -88,7 +93,7 @@ def near_faces(x, v, step, indenters, motion, surface, lists):  # type: ignore[n
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def gap_of(geometry, mesh, axes, k, d, q, m, n, none):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the gap of a point at d (3,) from the reference point of indenter k, and set its outward normal n; q and m are scratch."""
     kind, size, own = geometry[0][k], geometry[1][k], axes[k]
@@ -102,11 +107,11 @@ def gap_of(geometry, mesh, axes, k, d, q, m, n, none):  # type: ignore[no-untype
     return gap
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _primitive_gap(kind, size, axes, d, q, m, n, none):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Do what `gap_of` does for an indenter without a mesh: meshes are many arrays, which take time to hand over."""
     if kind == SPHERE:
-        return _gap_of_sphere(size[0], d, n)
+        return gap_of_sphere(size[0], d, n)
     for a in range(3):
         q[a] = axes[a, 0] * d[0] + axes[a, 1] * d[1] + axes[a, 2] * d[2]
     gap = distance_from_primitive(kind, size, q, m, none)
@@ -115,15 +120,7 @@ def _primitive_gap(kind, size, axes, d, q, m, n, none):  # type: ignore[no-untyp
     return gap
 
 
-@njit(cache=True)
-def _gap_of_sphere(radius, d, n):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Do what `gap_of` does for a sphere."""
-    r = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    n[0], n[1], n[2] = (d[0] / r, d[1] / r, d[2] / r) if r > 0.0 else (0.0, 0.0, 1.0)
-    return r - radius
-
-
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _gather(x, v, step, nodes, at, speed):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set at and speed (4, 3) to the positions after the step and the velocities of the nodes (4,) of a face."""
     pad = len(x) // 3
@@ -133,7 +130,7 @@ def _gather(x, v, step, nodes, at, speed):  # type: ignore[no-untyped-def]  # pr
             at[c, a] = x[a * pad + nodes[c]] + step * speed[c, a]
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _combine(shape, values, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set out (3,) to the values (4, 3) of the nodes of a face at a point with these shape functions (4,)."""
     for a in range(3):
@@ -165,18 +162,21 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]
         kind, size, turn, mesh, each = geometry[0][k], geometry[1][k], axes[k], mesh_of(geometry, k), rule[k + 1] - rule[k]
+        rows = turn[0, 0], turn[0, 1], turn[0, 2], turn[1, 0], turn[1, 1], turn[1, 2], turn[2, 0], turn[2, 1], turn[2, 2]
         _gather(x, v, step, corners[f], at, speed)
         at -= centres[k]
         for c in range(4):
             share[c] = multiplier[k, corners[f, c]]
         _face_normal(at, across)
-        stiff, spring = foundation[f, 0] / thickness[k, f], foundation[f, 1] / thickness[k, f]
+        stiff, spring, drag = foundation[f, 0] / thickness[k, f], foundation[f, 1] / thickness[k, f], step * TANGENTIAL * foundation[f, 0]
         for g in range(each):
             p, shape = first[k] + f * each + g, shapes[rule[k] + g]
-            weight = weights[p]
+            own, result, weight = linear[p], found[p], weights[p]
             _combine(shape, at, d)
-            if kind == SPHERE:
-                gap = _gap_of_sphere(size[0], d, n)
+            if kind in (PLANE, BOX):
+                gap, n[0], n[1], n[2] = distance_from_turned_block(kind, (size[0], size[1], size[2]), rows, d[0], d[1], d[2])
+            elif kind == SPHERE:
+                gap = gap_of_sphere(size[0], d, n)
             elif kind == MESH:
                 gap = gap_of(geometry, mesh, axes, k, d, q, m, n, none)
             else:
@@ -187,17 +187,16 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             if linear[p, ACTIVE] == 0.0:
                 if found[p, TOUCHING] != 0.0:
                     found[p] = 0.0
-                if _is_far(gap - carried / stiff, np.sqrt(weight), form[k, 0]):
+                if is_far(gap - carried / stiff, np.sqrt(weight), form[k, 0]):
                     found[p, UNDER] = 0.0
                     continue
-            own, result = linear[p], found[p]
             _combine(shape, speed, slip)
             exerted(own, slip, result)
             slope = _slope(n, across)
             _towards_face(n, across)
-            depth, kept, steep = _pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff)
+            depth, kept, steep = pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff)
             if form[k, 0] == 0.0:
-                found[p, UNDER] = _covered(NEAR * (1.0 - slope) * np.sqrt(weight) - gap, slope, np.sqrt(weight), 0.0)[1]
+                found[p, UNDER] = covered(NEAR * (1.0 - slope) * np.sqrt(weight) - gap, slope, np.sqrt(weight), 0.0)[1]
             hard = HARD * stiff if depth > form[k, 1] else 0.0
             own_pressure = stiff * (depth - compression[p]) + spring * extension[p] + kept * carried
             pressure = own_pressure + hard * max(depth - form[k, 1], 0.0) if kept > 0.0 else 0.0
@@ -210,13 +209,12 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             own[STIFF] = step * (stiff * steep + hard)
             own[PRESSURE] = pressure + own[STIFF] * away
             if friction[k, 0] > 0.0:
-                drag = step * TANGENTIAL * foundation[f, 0]
                 wrong_friction += weight * _return_mapping(own, traction[p], slip, drag, pressure, friction[k], slid, p, result)
                 limits += weight * friction[k, 1] * pressure
     return wrong, wrong_friction, total, limits
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _face_normal(at, across):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set across (3,) to the normal of a face with nodes at (4, 3); zero of a single node."""
     size = 0.0
@@ -256,57 +254,6 @@ def _towards_face(n, across):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 
 @njit(cache=True)
-def _covered(depth, slope, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return mean depth and covered fraction of a cell.
-
-    Depths are taken to be spread evenly over a cell, from what is nearest to the indenter: the lowest point of a sphere where that is
-    within the cell, else its corner. A disc as large as the cell has the mean depth under a sphere's lowest point exactly so; elsewhere
-    Gauss's rule integrates a part of the curvature itself.
-    """
-    width *= 1.0 - (1.0 - UPRIGHT) * min(max((slope - 0.7) / 0.3, 0.0), 1.0)
-    bend = width * curvature  # what the slope changes by over the cell
-    nearer = 0.5 * slope**2 / curvature if slope < 0.5 * bend else width * (0.5 * slope - 0.125 * bend)
-    mean = width * bend * (BESIDE + (0.25 / np.pi - BESIDE) * max(0.0, 1.0 - slope / max(bend, 1e-300)))
-    half = nearer + mean + EARLY * width * bend + 0.5 * width * LEAST_SLOPE
-    depth -= mean + 0.5 * width * LEAST_SLOPE  # nothing where a flat indenter just touches
-    if depth >= half:
-        return depth, 1.0
-    if depth <= -half:
-        return 0.0, 0.0
-    return (depth + half) ** 2 / (4.0 * half), (depth + half) / (2.0 * half)
-
-
-@njit(cache=True)
-def _facing(slope, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the fraction of its multiplier that a face bears: hardly any where it stands upright on a flat indenter.
-
-    Nodes at an edge have one multiplier for both sides of the edge, and what presses one side does not press the other.
-    """
-    return 1.0 if curvature > 0.0 else min(max((1.0 - slope) / 0.3, LEAST_FACING), 1.0)
-
-
-@njit(cache=True)
-def _pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return mean depth of a cell, the fraction of its multiplier that it exerts, and how fast its pressure grows with the depth.
-
-    The latter is relative to the foundation. Wherever the indenter is nearer than `reach`, the multiplier over the stiffness of the
-    foundation, the sum of both presses: it falls steadily to nothing as the indenter leaves, and derives from a convex potential.
-    """
-    mean, covered = _covered(depth, slope, width, curvature)
-    facing = _facing(slope, curvature)
-    if reach <= 0.0:
-        return mean, facing * covered, covered
-    whole, steep = _covered(depth + facing * reach, slope, width, curvature)
-    return mean, (whole - mean) / reach, steep
-
-
-@njit(cache=True)
-def _is_far(gap, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Tell whether an indenter covers nothing of a cell, whatever the slope of the gap."""
-    return gap >= 0.5 * width * (1.0 + 0.25 * width * curvature + LEAST_SLOPE)
-
-
-@njit(cache=True)
 def rest_at(x, indenters, surface, begun, history):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set the compression of the foundations at points (p,) that have not `begun` so that they exert nothing at the positions x.
 
@@ -333,8 +280,8 @@ def rest_at(x, indenters, surface, begun, history):  # type: ignore[no-untyped-d
                 for c in range(4):
                     reach += shapes[rule[k] + g, c] * multiplier[k, corners[f, c]] * thickness[k, f] / foundation[f, 0]
                 slope = _slope(n, across)
-                reach *= _facing(slope, form[k, 0])
-                compression[p] = _covered(reach - gap, slope, np.sqrt(weights[p]), form[k, 0])[0]
+                reach *= facing(slope, form[k, 0])
+                compression[p] = covered(reach - gap, slope, np.sqrt(weights[p]), form[k, 0])[0]
 
 
 @njit(cache=True)
