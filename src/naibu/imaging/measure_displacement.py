@@ -30,7 +30,7 @@ from naibu.imaging.feature_matching.harris import interest_points
 from naibu.imaging.feature_matching.relaxation_labelling import PotentialMatches, relaxed
 from naibu.imaging.feature_matching.scattered_interpolation import dense_from_sparse, sparse_displacement
 from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
-from naibu.imaging.preprocessing.object_mask import mask_in_view, mask_jumps
+from naibu.imaging.preprocessing.object_mask import LeftOut, left_out, mask_in_view, mask_jumps
 from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.preprocessing.volume_pair import require_known
@@ -48,6 +48,8 @@ SEARCH_FRACTION = 0.12  # search radius, in extents of the object
 OUTLIER, REJECTIONS = 3.0, 20  # matches further off than so many medians are rejected, in so many rounds at most
 BLOCK_MM, SEARCH_MM = 8.0, 12.0  # block size and search range of block matching
 MOST_NAMED = 3  # slices in a warning
+# in volumes of the object: space within it, and bright regions beside it, above which the user is told that they are left out
+LEFT_OUT, SEPARATE = 0.02, 0.2
 LEAST_RANGE = 30.0 / 256.0  # of the intensity range, above which the hybrid takes block matching: as in the report
 
 # what the diagnostics of the methods mean, with their units
@@ -62,6 +64,8 @@ FACTS = {
     "unconverged_cells": "cells of the spline grid that have not converged",
     "unconverged_fraction": "fraction of the cells in the object that have not converged",
     "parts": "parts that were measured by themselves, since they slide on each other",
+    "left_out_within": "space within the object that is left out as air outside, fraction of its volume",
+    "left_out_apart": "bright regions apart from the object that are left out, fraction of its volume",
     "coarse_factor": "block by block: voxels along an edge of the coarse voxels of this page",
     "blocks": "block by block: number of blocks",
     "passes": "block by block: passes through the volumes",
@@ -154,10 +158,13 @@ def measure_displacement(
     views = fields_of_view(reference, deformed)
     for volume, view, name in zip((reference, deformed), views, ("reference", "deformed"), strict=True):
         require_known(volume, view, name)
+    facts: dict[str, float | int | str] = {}
     if mask is None:
         view = views[0]
         inside = mask_in_view(reference, view)
-        doubts = _mask_doubts(inside)
+        left = left_out(reference, inside, view)
+        doubts = _mask_doubts(inside, left)
+        facts = {"left_out_within": left.surrounded, "left_out_apart": left.separate}
         # the surface has much of the contrast
         compared = ndimage.binary_dilation(inside, mask=in_box(view, reference.shape))
     else:
@@ -167,7 +174,7 @@ def measure_displacement(
         found = _correlated(reference, deformed, inside, (compared, deformed_mask), progress)
     else:
         found = _by_classic_method(reference, deformed, method, inside, progress)
-    return replace(found, warnings=doubts + found.warnings)
+    return replace(found, warnings=doubts + found.warnings, facts=found.facts | facts)
 
 
 def _require_measured(reference: Volume, deformed: Volume) -> None:
@@ -180,15 +187,26 @@ def _require_measured(reference: Volume, deformed: Volume) -> None:
             )
 
 
-def _mask_doubts(mask: BoolArray) -> tuple[str, ...]:
+def _mask_doubts(mask: BoolArray, left: LeftOut) -> tuple[str, ...]:
+    doubts = []
     jumps = mask_jumps(mask)
-    if not len(jumps):
-        return ()
-    where = ", ".join(f"{k - 1} and {k}" for k in jumps[:MOST_NAMED]) + (" ..." if len(jumps) > MOST_NAMED else "")
-    return (
-        f"The mask of the object that was found jumps between neighbouring slices ({where}, from 0): if the object has no such step, parts "
-        "of it are missing or too much is in it; give a `mask`.",
-    )
+    if len(jumps):
+        where = ", ".join(f"{k - 1} and {k}" for k in jumps[:MOST_NAMED]) + (" ..." if len(jumps) > MOST_NAMED else "")
+        doubts.append(
+            f"The mask of the object that was found jumps between neighbouring slices ({where}, from 0): if the object has no such step, "
+            "parts of it are missing or too much is in it; give a `mask`."
+        )
+    if left.surrounded > LEFT_OUT:
+        doubts.append(
+            f"Space within the object that is open to the outside, {left.surrounded:.0%} of the object's volume, is left out of its mask: "
+            "it is as dark as the air outside, and no denser. If it belongs to the object, give a `mask`."
+        )
+    if left.separate > SEPARATE:
+        doubts.append(
+            f"Bright regions apart from the object, {left.separate:.0%} of its volume, are left out of its mask, which holds the largest "
+            "region only. If they belong to the object, as a second lung or leg does, give a `mask` of all of it."
+        )
+    return tuple(doubts)
 
 
 def _by_classic_method(

@@ -7,7 +7,7 @@ import pytest
 from thorax import body, chest, chest_grid, lungs
 
 from naibu.core.volume import Volume
-from naibu.imaging.preprocessing.object_mask import mask_jumps, object_mask
+from naibu.imaging.preprocessing.object_mask import left_out, mask_jumps, object_mask
 from naibu.imaging.preprocessing.resampling import positions
 
 Array = np.ndarray
@@ -59,6 +59,64 @@ def test_the_marrow_of_a_limb_that_the_scan_cuts_belongs_to_it() -> None:
     r = np.hypot(x[..., 0], x[..., 1])
     limb = (r < 20.0) & (r > 6.0)
     assert object_mask(solid(limb))[r < 19.0].all()
+
+
+def lung(inside: float, *, opening: float = 4.0, mattress: bool = False) -> tuple[Volume, Array, Array]:
+    """Return a ball of 100 in air of 0 with a cavity of another intensity and a lattice of vessels, and what is cavity and open slit.
+
+    A slit opens it; vessels leave no room for a ball wider than the slit. A mattress of the intensity of the cavity may lie below.
+    """
+    x = lattice(56)
+    r = np.linalg.norm(x, axis=-1)
+    vessels = (np.abs(np.mod(x + 4.0, 8.0) - 4.0) < 1.0).sum(axis=-1) >= 2
+    slit = (np.abs(x[..., 0]) < opening) & (x[..., 1] < 0.0) & (np.abs(x[..., 2]) < 12.0) & (r >= 16.0)
+    values = np.where(r < 22.0, 100.0, 0.0)
+    values[(r < 16.0) & ~vessels] = inside
+    values[slit] = 0.0
+    if mattress:
+        values[(x[..., 1] > 20.0) & (r >= 22.0)] = inside
+    rng = np.random.default_rng(0)
+    return Volume.from_array(values + 3.0 * rng.standard_normal(values.shape), spacing_mm=(1.0,) * 3), r < 16.0, slit
+
+
+@pytest.mark.parametrize("mattress", [False, True])
+def test_what_is_denser_than_air_and_surrounded_belongs_to_the_object_though_it_is_open(mattress: bool) -> None:
+    volume, cavity, slit = lung(15.0, mattress=mattress)
+    mask = object_mask(volume)
+    assert mask[cavity].mean() > 0.98
+    assert mask[slit].mean() < 0.6  # its sides and its floor are blurred
+    x = lattice(56)
+    assert mask[np.linalg.norm(x, axis=-1) > 24.0].mean() < 0.005
+    left = left_out(volume, mask, (slice(None),) * 3)
+    assert left.surrounded < 0.02 and left.separate == 0.0
+
+
+def test_how_much_is_left_out_as_air_is_told() -> None:
+    volume, cavity, _ = lung(0.0)
+    mask = object_mask(volume)
+    left = left_out(volume, mask, (slice(None),) * 3)
+    assert mask[cavity].mean() < 0.6
+    assert left.surrounded == pytest.approx((cavity & ~mask).sum() / mask.sum(), rel=0.3)
+    x = lattice()
+    balls = [np.linalg.norm(x - [d, 0.0, 0.0], axis=-1) < r for d, r in ((-11.0, 10.0), (12.0, 9.0))]
+    two = solid(balls[0] | balls[1])
+    left = left_out(two, object_mask(two), (slice(None),) * 3)
+    assert left.surrounded == 0.0 and left.separate == pytest.approx(0.9**3, rel=0.1)
+
+
+def test_padding_about_the_circle_of_reconstruction_is_no_part_of_the_contrast() -> None:
+    """-3024 outside of the circle once put the threshold below air, and all that the circle holds into the mask."""
+    x = lattice()
+    r = np.hypot(x[..., 0], x[..., 1])
+    inside = np.hypot(x[..., 0], 1.4 * x[..., 1]) < 17.0
+    noise = 20.0 * np.random.default_rng(0).standard_normal(r.shape)
+    scan = np.where(r < 24.0, np.where(inside, 30.0, -1000.0) + noise, -3024.0)
+    mask = object_mask(Volume.from_array(scan, spacing_mm=(1.0,) * 3))
+    assert (mask != inside).sum() < 0.1 * inside.sum()
+    # a textured block in a background of one intensity is an object in air: nothing is padding
+    block = np.where(np.hypot(x[..., 0], x[..., 1]) < 23.9, 100.0 + noise, 0.0)
+    mask = object_mask(Volume.from_array(block, spacing_mm=(1.0,) * 3))
+    assert (mask != (block > 0.0)).sum() < 0.06 * mask.sum()
 
 
 def test_jumps_between_slices_are_found() -> None:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.core.volume import Volume
+from naibu.imaging.preprocessing.aerated_tissue import aerated_tissue, meets_body
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
 from naibu.imaging.preprocessing.field_of_view import Box, in_box
+from naibu.imaging.preprocessing.pixel_padding import padding_as_air
 
 # empirical: upper bound of the threshold, in fractions from the mean of the air to that of the object: skin is darker than the mean
 DIMMEST = 0.3
@@ -22,6 +26,7 @@ THROAT_VOXELS = 300_000  # about so many coarse voxels show the throats
 # share of a slice, of the larger of two neighbours, in which their masks differ, above which the mask jumps
 JUMP = 0.25
 AIR = 0.01  # share of the field of view with exactly the intensity of the padding, above which that is the intensity of air
+SURROUNDED = 5  # of six directions along the axes, in which space meets the object that surrounds it but for an opening
 LEAST_AREA = 0.02  # of the largest slice: smaller ones are the tip of an object, where slices differ much
 
 
@@ -48,7 +53,8 @@ def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
     Notes
     -----
     Cavities are found in three dimensions: air is outside if it is connected to air on a face of the volume that no outline encloses within
-    that face. A cavity may be open to the outside, as lungs are by the trachea, through a throat much narrower than itself.
+    that face. A cavity may be open to the outside, as lungs are by the trachea, through a throat much narrower than itself. Through a wide
+    opening it belongs to the object if it is denser than the air outside, as aerated tissue is, and surrounded by the object.
     """
     smooth = _smoothed(volume)
     found = smooth > _limit(smooth)
@@ -73,7 +79,7 @@ def object_threshold(volume: Volume) -> float:
 
 def _smoothed(volume: Volume) -> Float32Array:
     reach = tuple(SMOOTHING if n > 1 else 0.0 for n in volume.shape)
-    return np.asarray(ndimage.gaussian_filter(np.asarray(volume.values, dtype=np.float32), reach))
+    return np.asarray(ndimage.gaussian_filter(np.asarray(padding_as_air(volume.values), dtype=np.float32), reach))
 
 
 def _limit(smooth: Float32Array) -> float:
@@ -134,6 +140,44 @@ def mask_jumps(mask: BoolArray) -> IntArray:
     return np.asarray(filled[0] + 1 + np.flatnonzero(jumps), dtype=np.int64)
 
 
+@dataclass(frozen=True, slots=True)
+class LeftOut:
+    """What a mask leaves out that may belong to the object, in fractions of its volume.
+
+    Attributes
+    ----------
+    surrounded : float
+        Space that the object surrounds but for an opening, and that is as dark as the air outside.
+    separate : float
+        Bright regions that are not connected to the object.
+    """
+
+    surrounded: float
+    separate: float
+
+
+def left_out(volume: Volume, mask: BoolArray, view: Box) -> LeftOut:
+    """Return what the mask of an object, as `mask_in_view` finds it, leaves out that may belong to it.
+
+    Parameters
+    ----------
+    volume : Volume
+        Scan.
+    mask : ndarray, shape (nz, ny, nx), bool
+        The object.
+    view : tuple of slice
+        Field of view of the scan.
+    """
+    inside = mask[view]
+    smooth = _smoothed(Volume.from_array(volume.values[view], spacing_mm=volume.spacing_mm))
+    dark = smooth <= _limit(smooth)
+    surrounded = dark & ~inside & (meets_body(inside) >= SURROUNDED)
+    # the outline is closed, and what is blurred about it is bright
+    near = ndimage.binary_dilation(inside, iterations=CLOSING + 1)
+    size = max(int(inside.sum()), 1)
+    return LeftOut(float(surrounded.sum()) / size, float((~dark & ~near).sum()) / size)
+
+
 def _with_cavities(bright: BoolArray, volume: Volume) -> BoolArray:
     """Return the bright region with the cavities that it encloses, also those that are open through a throat."""
     outside = _from_outside(~bright, ~bright)
@@ -141,7 +185,8 @@ def _with_cavities(bright: BoolArray, volume: Volume) -> BoolArray:
     stride = np.maximum(np.round(voxel / volume.spacing_mm[::-1]), 1).astype(int)
     # coarse voxels are bright where any of theirs is: thin walls stay closed
     blocked = _blocks(~outside, stride)
-    cavities = _through_throats(blocked, volume.spacing_mm[::-1] * stride)
+    cavities = aerated_tissue(padding_as_air(volume.values), bright, outside, stride)
+    cavities |= _through_throats(blocked | cavities, volume.spacing_mm[::-1] * stride)
     if cavities.any():
         fine = cavities.repeat(stride[0], 0).repeat(stride[1], 1).repeat(stride[2], 2)[tuple(map(slice, bright.shape))]
         fine = ndimage.binary_dilation(fine & outside, iterations=int(stride.max()) + 1, mask=outside)
