@@ -377,7 +377,7 @@ class LivePage {
     if (!frame.driving) text += " (watching)";
     const write = (element, said) => { if (element.textContent !== said) element.textContent = said; };
     write(this.badge, text);
-    write(this.caution, this.scene.tools[frame.tool]?.caution ?? "");
+    write(this.caution, (frame.tool < 0 ? this.scene.grip_caution : this.scene.tools[frame.tool]?.caution) ?? "");
     this.badge.dataset.held = String(real >= 97 || frame.paused || frame.replaying);
     write(this.pause, frame.paused ? "▶ Go on" : "❚❚ Pause");
     write(this.record, frame.recording ? "■ Stop" : "● Record");

@@ -90,8 +90,8 @@ class InteractiveBody(Protocol):
     def unbalanced(self, session: AnySession) -> float:
         """Return the out-of-balance force that the last step left to the next ones, as a fraction of all forces."""
 
-    def caution(self, name: str, tool: RigidIndenter) -> str:
-        """Return what is to be said of the forces of a tool of this name; empty where nothing is."""
+    def caution(self, name: str, tool: RigidIndenter | None) -> str:
+        """Return what is to be said of the forces of a tool of this name, or of a grip (None); empty where nothing is."""
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return a scalar strain at the nodes (n,), %, at positions (n, 3), mm."""
@@ -205,9 +205,9 @@ class LatticeBody:
         """Return 0: a step of a lattice leaves nothing out of balance."""
         return 0.0
 
-    def caution(self, name: str, tool: RigidIndenter) -> str:
+    def caution(self, name: str, tool: RigidIndenter | None) -> str:
         """Return that the faces of the lattice do not resolve what a tool touches, and by how much its force may be wrong; else nothing."""
-        return unresolved(self.engine.lattice, tool.geometry, name)
+        return "" if tool is None else unresolved(self.engine.lattice, tool.geometry, name)
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return the mean elongation of the elements at every node (n,), % of their length at rest."""
@@ -404,8 +404,8 @@ class FiniteElementBody:
         """Return the out-of-balance force that the last step left to the next ones, as a fraction of all forces."""
         return session.unbalanced if isinstance(session, RealTimeSession) else 0.0
 
-    def caution(self, name: str, tool: RigidIndenter) -> str:
-        """Return that behind cuts the force of a tool may be too low, and by how much; else nothing.
+    def caution(self, name: str, tool: RigidIndenter | None) -> str:
+        """Return that behind cuts the force of a tool, or of a grip, may be too low, and by how much; else nothing.
 
         How wrong forces of tools smaller than elements are was not measured.
         """

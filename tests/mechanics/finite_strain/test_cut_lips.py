@@ -281,5 +281,6 @@ def test_how_much_too_soft_a_body_between_walls_is_behind_a_cut_is_said(height, 
     ):  # of smaller ratios the stresses along the cut and across it differ, and sides that slide relieve shear as they ought to
         assert 0.5 * said < softer < said
     assert ("too low where walls keep" in body.caution("the plate", tool)) == (said >= 5.0)
+    assert body.caution("the pull", None) == body.caution("the plate", tool).replace("the plate", "the pull")
     assert (said >= 5.0) == (ratio == 0.49 or (ratio == 0.45 and tilt > 0.0))
     assert softer_behind_cuts(plain) == 0.0 and FiniteElementBody.of(whole, plain).caution("the plate", tool) == ""

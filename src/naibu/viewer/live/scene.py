@@ -103,6 +103,8 @@ class LiveScene:
         What is computed before a cut opens, in the order in which frames number it.
     cautions : sequence of str
         What the page says of the forces of each tool while it is in play; empty texts, or none at all, where there is nothing to say.
+    grip_caution : str
+        What it says of the force of a grip while no tool is in play.
     """
 
     title: str
@@ -122,6 +124,7 @@ class LiveScene:
     readings: Sequence[LiveReading] = ()
     cut_stages: Sequence[str] = ()
     cautions: Sequence[str] = ()
+    grip_caution: str = ""
 
     def payload(self) -> dict[str, object]:
         """Return the scene for JSON; ``viewer-src/src/live-decode.js`` is the inverse."""
@@ -140,6 +143,7 @@ class LiveScene:
                 "weights": _base64(self.marker_weights, "<f4"),
                 "each": self.marker_nodes.shape[1],
             },
+            "grip_caution": self.grip_caution,
             "strain": self.strain,
             "frame_s": self.frame_s,
             "topology": self.topology,

@@ -70,6 +70,7 @@ class LiveSimulation:
             self.model.marker_weights[: None if whole else 0], topology, cuttable=self.model.cuttable,
             readings=() if self.model.sensor is None else self.model.sensor.readings, cut_stages=CUT_STAGES,
             cautions=[body.caution(f"the {name}", tool) for name, tool in tools.items()],
+            grip_caution=body.caution("the pull", None),
         )  # fmt: skip
 
     @property
