@@ -122,3 +122,20 @@ def test_a_plate_that_drags_slides_as_coulomb_says_and_takes_few_solutions() -> 
     assert motion.unsettled <= 1
     np.testing.assert_allclose(sliding[:, 0], 0.3 * np.abs(sliding[:, 2]), rtol=1e-3)
     assert motion.passes < 7.0
+
+
+@pytest.mark.parametrize("shorter", [0.1, 0.5, 2.0, 10.0])
+def test_a_plate_at_rest_presses_alike_whatever_the_next_step_is(shorter: float) -> None:
+    """A block that slid under a plate and rests is in balance: the next step changes nothing, however long it is.
+
+    Points that had come away by what their multiplier still pressed had kept it: the foundations of steps a tenth as long are several
+    times as stiff, and the force had jumped by half.
+    """
+    path = np.zeros((500, 2, 3))
+    path[:100, 1, 2], path[100:200, 1, 0] = -20.0, 50.0
+    engine, other = engine_of(0.002), engine_of(0.002 * shorter)
+    motion = push(engine, engine.rest(), plates(0.3), path)
+    assert abs(motion.reaction[199, 1, 0]) > 0.29 * abs(motion.reaction[199, 1, 2])  # it slides
+    still = push(other, motion.state, plates(0.3), np.zeros((5, 2, 3)))
+    size = np.linalg.norm(motion.reaction[-1, 1])
+    np.testing.assert_allclose(still.reaction[:, 1] / size, np.broadcast_to(motion.reaction[-1, 1] / size, (5, 3)), atol=0.02)

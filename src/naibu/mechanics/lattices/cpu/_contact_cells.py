@@ -11,6 +11,7 @@ LEAST_FACING = 0.01
 # of the width of a cell times what the slope changes by over it: mean gap over that at the point, beside the lowest point of an indenter;
 # and by how much earlier a cell begins to be covered than it is, so that it is not so at once
 BESIDE, EARLY = 1.0 / 24.0, 1.0 / 16.0
+NEAR = 0.1  # of the width of a cell that looks at a flat indenter: it has what is as near as that
 UPRIGHT = 0.75  # width of the cells of a face that stands upright on an indenter: Gauss points lie nearer to its edge than they are wide
 
 
@@ -63,3 +64,10 @@ def pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-d
 def is_far(gap, width, curvature):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Tell whether an indenter covers nothing of a cell, whatever the slope of the gap."""
     return gap >= 0.5 * width * (1.0 + 0.25 * width * curvature + LEAST_SLOPE)
+
+
+@njit(cache=True, **UNCOUNTED)
+def near_flat(gap, slope, width):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the fraction of a cell that a flat indenter has near, and the fraction of its multiplier that the cell bears with that."""
+    fraction = covered(NEAR * (1.0 - slope) * width - gap, slope, width, 0.0)[1]
+    return fraction, fraction * facing(slope, 0.0)

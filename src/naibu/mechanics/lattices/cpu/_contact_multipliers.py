@@ -14,12 +14,14 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu.mechanics.lattices.cpu._contact_points import ALONG, OWN, TOUCHING, UNDER, exerted
+from naibu.mechanics.lattices.cpu._contact_points import ALONG, BORNE, OWN, TOUCHING, UNDER, exerted
 from naibu.mechanics.lattices.model.contact_surface import PER_RADIUS, SHARED, THINNEST
 
 EARNEST = 0.25  # covered fraction of a face that counts
 BARELY, NEARLY = 0.4, 0.9  # covered fractions around a node between which it begins to carry pressure without the foundation
 MOST_KEPT = 0.95  # fraction that a node carries at most where multipliers are found with the step: at 1 nothing would bound them
+# of what a point lacks of its multiplier where a flat indenter has begun to come away, in a step: all at once makes others come and go
+GIVEN_BACK = 0.5
 COLUMNS = 6  # numbers of a node: see `update_multipliers`
 GAIN, COVERING, LARGEST, STIFFNESS, SHARE, BEFORE = range(COLUMNS)
 
@@ -164,7 +166,11 @@ def _gather_stiffness(count, surface, thickness, lists, found, stiffness):  # ty
 
 @njit(cache=True, **UNCOUNTED)
 def _release(count, form, surface, multiplier, lists, found, nodal):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Take from the nodes the pressure that points near a flat indenter no longer exert, all of it where no point around them does."""
+    """Take from the nodes the pressure that points near a flat indenter no longer exert, all of it where no point around them does.
+
+    A point that has come away, but not as far as its multiplier presses, exerts less than that by what the foundation yields over the gap,
+    and how stiff that is depends on the length of the step: were the multiplier to stay, so would the force.
+    """
     corners, _, _, shapes, weights, first, rule = surface
     gain, covering = nodal[GAIN], nodal[COVERING]
     for entry in range(count):
@@ -177,12 +183,14 @@ def _release(count, form, surface, multiplier, lists, found, nodal):  # type: ig
         each = rule[k + 1] - rule[k]
         for g in range(each):
             p, shape, carried = first[k] + f * each + g, shapes[rule[k] + g], 0.0
-            if found[p, TOUCHING] > 0.0 or found[p, UNDER] == 0.0:
+            part = found[p, TOUCHING]
+            lost = GIVEN_BACK * max(found[p, BORNE] - part, 0.0) if part > 0.0 else found[p, UNDER]
+            if lost == 0.0:
                 continue
             for c in range(4):
                 carried += shape[c] * multiplier[k, corners[f, c]]
             for c in range(4):
-                gain[k, corners[f, c]] -= weights[p] * shape[c] * found[p, UNDER] * carried
+                gain[k, corners[f, c]] -= weights[p] * shape[c] * lost * carried
 
 
 @njit(cache=True, **UNCOUNTED)

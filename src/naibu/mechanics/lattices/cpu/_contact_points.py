@@ -28,7 +28,7 @@ from naibu.mechanics.contact._geometry_kernels import (
     mesh_of,
     signed_distance,
 )
-from naibu.mechanics.lattices.cpu._contact_cells import covered, facing, is_far, pressed
+from naibu.mechanics.lattices.cpu._contact_cells import covered, facing, is_far, near_flat, pressed
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
@@ -37,13 +37,12 @@ MARGIN = 0.25  # of the radius of a face, by which it may be off what was forese
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
 STRAIGHT = 0.5  # cosine of the angle between the frictions of two passes below which a point turns
-NEAR = 0.1  # of the width of a cell that looks at a flat indenter: it has what is as near as that
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
 # velocity of the indenter, covered fraction of the cell, unit vector of friction that slides, drag missing along it, whether that turned
 NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, ALIGNED, SLACK, TURNED, COLUMNS = 0, 3, 4, 7, 8, 9, 12, 13, 16, 17, 18
 # columns of what it exerts: force, friction, pressure, covered fraction, pressure besides the multiplier, fraction that a flat indenter
-# has near
-FORCE, TANGENT, ALONG, TOUCHING, OWN, UNDER, RESULTS = 0, 3, 6, 7, 8, 9, 10
+# has near, and what it would bear of its multiplier if that touched it
+FORCE, TANGENT, ALONG, TOUCHING, OWN, UNDER, BORNE, RESULTS = 0, 3, 6, 7, 8, 9, 10, 11
 
 
 @njit(cache=True, **COUNTED)
@@ -188,7 +187,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
                 if found[p, TOUCHING] != 0.0:
                     found[p] = 0.0
                 if is_far(gap - carried / stiff, np.sqrt(weight), form[k, 0]):
-                    found[p, UNDER] = 0.0
+                    found[p, UNDER], found[p, BORNE] = 0.0, 0.0
                     continue
             _combine(shape, speed, slip)
             exerted(own, slip, result)
@@ -196,7 +195,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             _towards_face(n, across)
             depth, kept, steep = pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff)
             if form[k, 0] == 0.0:
-                found[p, UNDER] = covered(NEAR * (1.0 - slope) * np.sqrt(weight) - gap, slope, np.sqrt(weight), 0.0)[1]
+                found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, np.sqrt(weight))
             hard = HARD * stiff if depth > form[k, 1] else 0.0
             own_pressure = stiff * (depth - compression[p]) + spring * extension[p] + kept * carried
             pressure = own_pressure + hard * max(depth - form[k, 1], 0.0) if kept > 0.0 else 0.0
