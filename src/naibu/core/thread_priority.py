@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from naibu.core.cores import usable_cores
 
-REST_S = 6e-5  # least rest of a step of a thread that is scheduled first: Linux stops those that take more than 95 % of a core for 50 ms
+REST_S = 1.2e-4  # least rest of a step of a thread that is scheduled first: Linux stops those that take more than 95 % of a core for 50 ms
 
 
 @contextmanager

@@ -82,7 +82,11 @@ class UpdatedFactors:
 
     def prepare(self, nodes: IntArray) -> None:
         """Compute the part of the inverse that belongs to nodes (k,) and those of earlier calls."""
-        new = np.unique(nodes[self._slot[nodes] < 0])
+        self._add(np.unique(nodes[self._slot[nodes] < 0]))
+        self._gather()
+
+    def _add(self, new: IntArray) -> None:
+        """Compute the columns of the inverse that belong to nodes (k,) that are not known yet."""
         if len(new) == 0:
             return
         own = _rows(new)
@@ -95,14 +99,18 @@ class UpdatedFactors:
         self._slot[new] = len(self._nodes) + np.arange(len(new))
         self._nodes = np.concatenate([self._nodes, new])
         self._columns.append(columns)
-        at = _rows(self._nodes)
-        self._inverse = np.concatenate([part.T.take(at, axis=1) for part in self._columns]).T
+
+    def _gather(self) -> None:
+        """Take the part between the nodes out of the columns; it is of the order of its square, and not done after every few nodes."""
+        if len(self._inverse) < 3 * len(self._nodes):
+            at = _rows(self._nodes)
+            self._inverse = np.concatenate([part.T.take(at, axis=1) for part in self._columns]).T
 
     def prepared(self, nodes: IntArray) -> Iterator[None]:
         """Prepare a few nodes of (k,) at a time, and yield between them, until all are known: one may go on later."""
         while len(left := nodes[~self.covered(nodes)]):
             yield
-            self.prepare(left[:FEW])
+            self._add(np.unique(left)[:FEW])
 
     def solve(self, b: FloatArray) -> FloatArray:
         """Return x of ``A x = b`` for b of shape (3 n,)."""
