@@ -8,7 +8,7 @@ import pytest
 from naibu.core.arrays import FloatArray as Array
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields import estimate
+from naibu.identification.from_fields import size_correction
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.forward import forward_model
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
@@ -89,9 +89,9 @@ def test_a_change_of_small_strain_is_doubted_whole(monkeypatch: pytest.MonkeyPat
     (u,) = (body.displacement(p) for p in body.pushes)
     field = DisplacementField.from_arrays(body.mesh.points, u + 0.01 * rng.standard_normal(u.shape), sd_mm=0.01)
     cases, doubts = [FieldLoadCase.of("push", field, body.mesh, loaded=body.constrained)], []
-    made = estimate.changes_on_finer_mesh
+    made = size_correction.changes_on_finer_mesh
     for law in ("neo_hookean", "linear"):
-        monkeypatch.setattr(estimate, "changes_on_finer_mesh", lambda *a, law=law: (made(*a)[0], law))
+        monkeypatch.setattr(size_correction, "changes_on_finer_mesh", lambda *a, law=law: (made(*a)[0], law))
         found = identify_field(body.mesh, cases, body.zones(), law="neo_hookean")
         assert found.budget is not None and any("from small strain" in step for step in found.steps) == (law == "linear")
         doubts.append(found.budget.mesh[: found.zones.count])

@@ -31,10 +31,9 @@ from naibu.identification.from_fields.forward.sensitivities import (
     Linearised,
     Point,
     logarithms,
-    moduli_of,
     young_and_poisson,
 )
-from naibu.identification.from_fields.forward.zones_within_cells import RegionAt, moduli_within_cells
+from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.inversion.gauss_newton import (
     Bounds,
     Found,
@@ -51,11 +50,8 @@ from naibu.identification.from_fields.inversion.truncated_newton import truncate
 from naibu.identification.from_fields.mesh_error import (
     COARSE,
     at_least_to,
-    changes_on_finer_mesh,
     doubt_in_all,
-    extrapolated,
     one_cell_thick,
-    refitted,
     relative_change,
     stretch_of,
 )
@@ -67,10 +63,12 @@ from naibu.identification.from_fields.regions.border_refinement import (
     refined_regions,
 )
 from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
+from naibu.identification.from_fields.size_correction import SizeCorrection, without_size_of_elements
 from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.surface_bias import bias_of_surface
+from naibu.identification.from_fields.surface_noise import SurfaceNoise
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
-from naibu.identification.from_fields.verdict import inflation, verdict
+from naibu.identification.from_fields.verdict import inflation, verdict, with_enough_points
 from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
 from naibu.identification.load_case import require_load_cases
 
@@ -366,26 +364,23 @@ class _Recipe:
     ) -> FieldEstimate:
         """Return moduli that were fitted without a penalty, with the errors of measurement, discretisation and knowledge."""
         at = model.linearised(point)
-        quadratic = at.concentrated(np.eye(2 * model.zones.count))
-        shift: FloatArray | None
-        if corrected is not None:
-            theta, residuals, shift, alike = corrected.refined.theta, corrected.residuals, corrected.shift, True
-            stretch = np.ones_like(theta)
-        else:
-            theta, residuals, shift, alike = self._extrapolated(at, quadratic)
-            stretch = stretch_of(np.zeros_like(theta) if shift is None else shift)
-            if refined is not None:
-                theta = Objective(bounds=self.bounds).clipped(theta + refined.theta - point.theta)
-        misfit, freedom = sum(float(r @ r) for r in residuals), model.n_free - 2.0 * model.zones.count
+        quadratic, freedom = at.concentrated(np.eye(2 * model.zones.count)), model.n_free - 2.0 * model.zones.count
+        variance = point.misfit / freedom if freedom > 0.0 else 1.0
+        noise = SurfaceNoise.of(at, quadratic, variance)
+        size = self._size(at, quadratic, noise, refined, corrected)
+        theta, residuals, shift, alike = size.theta, size.residuals, size.shift, size.alike
+        stretch = stretch_of(np.zeros_like(theta) if shift is None or corrected is not None else shift)
+        misfit = sum(float(r @ r) for r in residuals)
         factor = 1.0 if freedom <= 0.0 else max(1.0, float(np.sqrt(misfit / freedom)))
-        of_noise = Uncertainty.of(quadratic.hessian, factor)
+        of_noise = Uncertainty.of(noise.information.matrix, factor)
         shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
+        of_noise = of_noise.with_added(size.of_noise)
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders)).with_added(refined.apart)
         on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
         of_known = covariance_of(others := assumptions(at, quadratic, self.law, stretch, self.borders), len(theta))
-        judged, names = verdict(model.observed, residuals, freedom), model.zones.names
+        judged, names = with_enough_points(verdict(model.observed, residuals, freedom), model), model.zones.names
         thin = () if self.region_at is None or corrected is not None else one_cell_thick(model.mesh)
         if self.region_at is not None and shift is not None:
             half = HalfSize(point.theta, theta, on_mesh, beyond_noise=(point.misfit - freedom, misfit - freedom))
@@ -402,7 +397,7 @@ class _Recipe:
                 covariance, coarse = corrected.doubt, not corrected.converged
             covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
             of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
-        best, (bias, left) = theta, bias_of_surface(at, quadratic, point.misfit / freedom if freedom > 0.0 else 1.0)
+        best, (bias, left) = theta, bias_of_surface(at, quadratic, variance, noise.information)
         total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
@@ -417,6 +412,25 @@ class _Recipe:
             judged, budget, shift, others, borders, parts, best - theta,
         )  # fmt: skip
 
+    def _size(
+        self,
+        at: Linearised,
+        quadratic: Concentrated,
+        noise: SurfaceNoise,
+        refined: RefinedRegions | None,
+        corrected: CorrectedRegions | None,
+    ) -> SizeCorrection:
+        """Return the best fit at vanishing element size, which regions whose borders run through cells may have already."""
+        if corrected is not None:
+            none = np.zeros_like(quadratic.hessian)
+            return SizeCorrection(corrected.refined.theta, corrected.residuals, corrected.shift, True, none, ())
+        found = without_size_of_elements(at, quadratic, noise, self.law, self.elements, self.bounds, self.region_at)
+        for told in found.told:
+            self.record(told)
+        if refined is None:
+            return found
+        return replace(found, theta=Objective(bounds=self.bounds).clipped(found.theta + refined.theta - at.point.theta))
+
     def _doubt_at_bounds(self, theta: FloatArray) -> FloatArray:
         """Return standard deviations for logarithms at a bound, where derivatives say nothing of how far from it they may be."""
         k, (low, high) = len(theta) // 2, self.bounds.box(len(theta) // 2)
@@ -424,25 +438,3 @@ class _Recipe:
         of_shear = np.flatnonzero((theta[:k] <= low[:k] + 1e-9) | (theta[:k] >= high[:k] - 1e-9))
         doubt[of_shear] = high[of_shear] - low[of_shear]
         return doubt
-
-    def _extrapolated(self, at: Linearised, quadratic: Concentrated) -> tuple[FloatArray, tuple[FloatArray, ...], FloatArray | None, bool]:
-        """Return theta and whitened residuals at vanishing element size, and the change of theta; None where it was not estimated.
-
-        Also whether that change is one under the law of the identification.
-        """
-        fitted, model, where = at.point.theta, at.model, self.region_at
-
-        def moduli_on(mesh: Mesh, zones: Zones) -> tuple[FloatArray, FloatArray]:
-            return moduli_of(zones, fitted) if where is None else moduli_within_cells(mesh, model.zones, fitted, where)
-
-        changes = changes_on_finer_mesh(at, self.law, moduli_on) if self.elements == "accurate" else None
-        if changes is None:
-            return fitted, tuple(o.residual(u) for o, u in zip(model.observed, at.point.states, strict=True)), None, True
-        if changes[1] != self.law:
-            self.record("elements of half the size find no equilibrium at finite strain: what they change is taken from small strain")
-        finer = refitted(at, quadratic, changes[0])
-        theta = Objective(bounds=self.bounds).clipped(extrapolated(fitted, finer.theta))
-        young, before = young_and_poisson(theta)[0], young_and_poisson(fitted)[0]
-        most = 100.0 * float(np.abs(young / before - 1.0).max())
-        self.record(f"half the element size: Young's modulus changes by up to {most:.2g} % when extrapolated to vanishing size")
-        return theta, finer.residuals, theta - fitted, changes[1] == self.law

@@ -13,11 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.sparse as sp
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.forward.field_laws import LawName, computed_mesh, field_law
+from naibu.identification.from_fields.forward.field_laws import FieldLaw, LawName, computed_mesh, field_law
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, settled
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
@@ -203,6 +204,42 @@ def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> 
     return None
 
 
+def changes_of_motions(at: Linearised, moduli_on: ModuliOn, motions: list[FloatArray]) -> list[FloatArray]:
+    """Return by how much the whitened measurements (q, k) of small motions change on a mesh of half the element size, at small strain.
+
+    Parameters
+    ----------
+    at, moduli_on
+        See `changes_on_finer_mesh`.
+    motions : list of ndarray, shape (n d, k)
+        Of every load case, mm; those of the loaded nodes count, the others follow.
+    """
+    model, finer = at.model, _Finer.of(at, moduli_on)
+    body = field_law(finer.computed, "linear", averaged=finer.averaged)
+    coarse = field_law(model.computed, "linear", averaged=model.averaged)
+    solvers, of_coarse = Solvers(body, finer.computed.points, iterative=True), Solvers(coarse, model.points)
+    lame, shear = moduli_of(model.zones, at.point.theta)
+    out = []
+    for o, moved in zip(model.observed, motions, strict=True):
+        on = finer.observed(o)
+        guesses = [finer.guess(on, u.reshape(model.points.shape)) for u in moved.T]
+        fine = _at_small_strain(body, solvers, finer.lame, finer.shear, on, guesses)
+        here = _at_small_strain(coarse, of_coarse, lame, shear, o, [u.reshape(model.points.shape) for u in moved.T])
+        out.append(np.asarray(on.operator @ fine - o.operator @ here))
+    return out
+
+
+def _at_small_strain(
+    law: FieldLaw, solvers: Solvers, lame: FloatArray, shear: FloatArray, o: Observed, guesses: list[FloatArray]
+) -> FloatArray:
+    """Return displacements (n d, k), mm, in equilibrium without external forces, loaded nodes as in `guesses` (n, d)."""
+    constrained = o.load_case.loaded
+    factor = solvers.factorized(lame, shear, np.zeros_like(guesses[0]), constrained)
+    right = np.stack([np.where(constrained, 0.0, law.forces(lame, shear, u)).ravel() for u in guesses], axis=1)
+    step = np.where(constrained.ravel()[:, None], 0.0, factor.solve(right))
+    return np.stack([u.ravel() for u in guesses], axis=1) - step
+
+
 def _small_strain(at: Linearised) -> tuple[FloatArray, ...]:
     """Return the states (n, d), mm, of small strain with the same moduli and the same displacement of the loaded nodes."""
     model, law = at.model, field_law(at.model.computed, "linear", averaged=at.model.averaged)
@@ -213,19 +250,59 @@ def _small_strain(at: Linearised) -> tuple[FloatArray, ...]:
 
 
 def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...], moduli_on: ModuliOn) -> list[FloatArray]:
-    model, finer = at.model, Refinement.of(at.model.mesh)
-    computed, averaged = computed_mesh(finer.mesh, "accurate")
-    body = field_law(computed, law, averaged=averaged)
-    zones = finer.zones(model.zones)
-    lame, shear = moduli_on(finer.mesh, zones)
-    solvers, between = Solvers(body, computed.points, iterative=True), interpolation_operator(model.computed, computed.points)
-    out = []
-    for o, u in zip(model.observed, states, strict=True):
-        of_nodes = o.load_case if finer.mesh.n_points == len(u) else finer.load_case(o.load_case)
-        on = Observed.of(finer.mesh, computed, of_nodes)
-        guess = np.asarray(between @ u)
-        nodes = guess[: finer.mesh.n_points].ravel()
-        guess.ravel()[on.loaded] = on.basis @ nodes[on.unknown]
-        state = settled(body, solvers, computed.points, lame, shear, on.load_case, guess)
+    finer = _Finer.of(at, moduli_on)
+    body = field_law(finer.computed, law, averaged=finer.averaged)
+    solvers, out = Solvers(body, finer.computed.points, iterative=True), []
+    for o, u in zip(at.model.observed, states, strict=True):
+        on = finer.observed(o)
+        state = settled(body, solvers, finer.computed.points, finer.lame, finer.shear, on.load_case, finer.guess(on, u))
         out.append(on.residual(state) - o.residual(u))
     return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Finer:
+    """A body on cells of half the size.
+
+    Attributes
+    ----------
+    refinement : Refinement
+        Of its mesh.
+    computed : Mesh
+        On which equilibrium is computed.
+    averaged : bool
+        Whether with mean dilatation.
+    lame, shear : ndarray, shape (8 m,)
+        Moduli, kPa.
+    between : csr_array, shape (n_fine, n)
+        Interpolation from the nodes on which the coarse equilibrium is computed.
+    """
+
+    refinement: Refinement
+    computed: Mesh
+    averaged: bool
+    lame: FloatArray
+    shear: FloatArray
+    between: sp.csr_array
+
+    @classmethod
+    def of(cls, at: Linearised, moduli_on: ModuliOn) -> _Finer:
+        """Halve the cells of a body."""
+        refinement = Refinement.of(at.model.mesh)
+        computed, averaged = computed_mesh(refinement.mesh, "accurate")
+        lame, shear = moduli_on(refinement.mesh, refinement.zones(at.model.zones))
+        between = interpolation_operator(at.model.computed, computed.points)
+        return cls(refinement, computed, averaged, lame, shear, between)
+
+    def observed(self, o: Observed) -> Observed:
+        """Return the measurements of a load case on it."""
+        mesh = self.refinement.mesh
+        of_nodes = o.load_case if mesh.n_points == len(o.load_case.loaded) else self.refinement.load_case(o.load_case)
+        return Observed.of(mesh, self.computed, of_nodes)
+
+    def guess(self, on: Observed, u: FloatArray) -> FloatArray:
+        """Return the displacement (n_fine, d), mm, interpolated from the coarse one (n, d), with the loaded components as sought."""
+        guess = np.asarray(self.between @ u)
+        nodes = guess[: self.refinement.mesh.n_points].ravel()
+        guess.ravel()[on.loaded] = on.basis @ nodes[on.unknown]
+        return guess

@@ -16,16 +16,18 @@ from __future__ import annotations
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, modulus_columns
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised
 from naibu.identification.from_fields.mesh_error import refitted
+from naibu.identification.from_fields.surface_noise import CorrectedInformation, tangent_columns
 
 # part of the bias that is reckoned with as a standard deviation after it was taken off: to first order, and from a biased motion
 LEFT = 0.5
 PROBES = 32  # vectors of random signs that estimate the trace: to a few per cent of the slope
-SMALL_STRAIN = 1e-4  # of the derivative of the tangent
 
 
-def bias_of_surface(at: Linearised, quadratic: Concentrated, variance: float) -> tuple[FloatArray, FloatArray]:
+def bias_of_surface(
+    at: Linearised, quadratic: Concentrated, variance: float, information: CorrectedInformation
+) -> tuple[FloatArray, FloatArray]:
     """Return the bias (2 count,) of the logarithms of the moduli that fit best, and the covariance (2 count, 2 count) of what is left.
 
     No more is taken off than one standard deviation of the measurement: a larger bias is not one of first order.
@@ -38,11 +40,13 @@ def bias_of_surface(at: Linearised, quadratic: Concentrated, variance: float) ->
         Of all logarithms there.
     variance : float
         Of the residuals over that stated; beyond 1 it may be that of errors of the model, which are not taken for noise here.
+    information : CorrectedInformation
+        On all logarithms, without that of noise.
     """
     explained = [-o.residual(u) for o, u in zip(at.model.observed, at.point.states, strict=True)]
-    sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(quadratic.hessian))))
+    sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(information.matrix))))
     of_prior = refitted(at, quadratic, explained).theta
-    of_noise = np.linalg.lstsq(quadratic.hessian, 0.5 * min(variance, 1.0) * slope_of_informed(at), rcond=1e-12)[0]
+    of_noise = information.step(0.5 * min(variance, 1.0) * slope_of_informed(at))
     bias = np.clip(of_prior + of_noise, -sd, sd)
     return bias, np.outer(LEFT * bias, LEFT * bias)
 
@@ -66,16 +70,5 @@ def slope_of_informed(at: Linearised) -> FloatArray:
     for t, o in enumerate(observed):
         answers[t][o.loaded] = 0.0
         for k in range(2 * PROBES):
-            out -= _tangent_columns(at, t, moved[t][:, k]).T @ answers[t][:, (k + PROBES) % (2 * PROBES)]
+            out -= tangent_columns(at, t, moved[t][:, k]).T @ answers[t][:, (k + PROBES) % (2 * PROBES)]
     return out / PROBES
-
-
-def _tangent_columns(at: Linearised, t: int, direction: FloatArray) -> FloatArray:
-    """Return what a relative change of every modulus adds to the forces (n d, 2 count) of a small displacement (n d,) about the state."""
-    model, state = at.model, at.point.states[t]
-    lame, shear = moduli_of(model.zones, at.point.theta)
-    extent = float(np.ptp(model.points, axis=0).max())
-    step = SMALL_STRAIN * extent / max(float(np.abs(direction).max()), 1e-300) * direction.reshape(state.shape)
-    ahead, behind = (modulus_columns(model.law, model.zones, lame, shear, state + side * step) for side in (1.0, -1.0))
-    scale = float(np.abs(step).max()) / max(float(np.abs(direction).max()), 1e-300)
-    return np.asarray((ahead - behind).toarray() / (2.0 * scale))

@@ -9,12 +9,14 @@ spatial blocks, the cluster-robust estimator of :cite:t:`liang1986`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.rigid_transform import registration
 from naibu.identification.from_fields.forward.forward_model import Observed
+from naibu.identification.from_fields.forward.sensitivities import FieldModel
 from naibu.identification.verdict import Explanation, Verdict, shared_part
 
 WITHIN_NOISE = 1.25  # residuals over the noise that need no explanation even if neighbours share them
@@ -22,6 +24,7 @@ NOISE_UNDERSTATED = 2.0  # residuals over the stated noise that may still be noi
 SMALL, LARGE = 0.02, 0.25  # of the deformation: so little needs no explanation, so much must not be left
 SHARED = 0.15
 OUTLIERS, OF_MISFIT = 0.1, 0.75  # fewer points that hold so much of the misfit are named; of normal errors half of them do
+POINTS_OF_CELL, LEAST_POINTS = 2, 1  # for every cell of a body whose surface is sought: fewer limit what is known, and fewer tell nothing
 BLOCKS, POINTS_PER_BLOCK, FEWEST_BLOCKS = 64, 6, 16
 
 
@@ -47,6 +50,20 @@ def verdict(observed: Sequence[Observed], residuals: Sequence[FloatArray], degre
         )
         reasons = (f"{lead}{alike}{few}" + ": question law, zones and known values" * (how is Explanation.IN_PART),)
     return Verdict(how, reasons, lead, factor, unexplained, shared)
+
+
+def with_enough_points(judged: Verdict, model: FieldModel) -> Verdict:
+    """Return the verdict with what is said where the motion of a whole surface is sought from too few points for the number of cells.
+
+    The surface then follows nearly any measurement, whatever the moduli, and residuals as small as the noise say nothing for them.
+    """
+    points, cells = max(len(o.points) for o in model.observed), model.mesh.n_cells
+    if not model.surface_sought or cells * POINTS_OF_CELL <= points:
+        return judged
+    few = f"{points} points for {cells} cells leave to the motion of the surface what would tell moduli: use larger cells"
+    if cells * LEAST_POINTS <= points:
+        return replace(judged, limits="; ".join(filter(None, (few, judged.limits))))
+    return replace(judged, explanation=Explanation.NOT_EXPLAINED, reasons=(few, *judged.reasons))
 
 
 def _told_outliers(misfit: FloatArray) -> str:
