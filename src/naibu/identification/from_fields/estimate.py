@@ -182,7 +182,7 @@ class _Recipe:
     def start(self, given: tuple[FloatArray, FloatArray] | None) -> Point:
         """Return where to begin: the given moduli, or those of the homogeneous body that fits best."""
         objective = Objective(bounds=self.bounds)
-        report_progress(self.progress, "finding how the loaded nodes move", done=0)
+        report_progress(self.progress, "finding how the loaded nodes move", done=0, total=1)
         if given is not None:
             return first_point(self.model, objective.clipped(logarithms(*(np.asarray(g, dtype=float) for g in given))))
         zones = self.model.zones
