@@ -282,7 +282,9 @@ def _track_clouds(
     wrote(run.page, *run.files)
     print_table(f"{clouds[0].name} -> {clouds[1].name}", ("quantity", "value"), run.rows)
     say(f"Page: {run.page}   field: {out / 'field.h5'}   links: {out / 'links.csv'}")
-    say(f"With a volume of zones: naibu identify {quote(str(out / 'field.h5'))} --zones labels.nii.gz --known 'gel=12 kPa'", "dim")
+    identify = f"naibu identify {quote(str(out / 'field.h5'))}"
+    say(f"With a volume of zones: {identify} --zones labels.nii.gz --known 'gel=12 kPa'", "dim")
+    say(f"Without, moduli as multiples: {identify} --mask {quote(str(out / 'mask.mha'))} --map", "dim")
 
 
 @verb(MARKERS, "track-sequence ultrasound.tif --pixel-mm 0.1 --diameter-mm 1 --frame-rate-hz 30")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -374,7 +375,20 @@ def test_triangles_in_plane_strain() -> None:
 def test_progress_and_steps_are_the_same_story() -> None:
     body, told = layered(), []
     found = identify_field(body.mesh, body.load_cases(sd_mm=0.1), body.zones(), progress=told.append)
-    assert tuple(r.stage for r in told) == found.steps and "homogeneous start" in told[0].stage
+    steps = [r for r in told if r.done is None]
+    assert tuple(r.stage for r in steps) == found.steps and "homogeneous start" in steps[0].stage
+
+
+def test_every_iteration_of_a_search_is_told_before_it_begins() -> None:
+    """A map of 2500 cells was silent for eight minutes until the first weight of its penalty was done."""
+    body, told = layered(), []
+    found = identify_field(body.mesh, body.load_cases(sd_mm=0.1), body.zones(), progress=told.append)
+    assert told[0].done == 0 and not told[0].stage.startswith("homogeneous")
+    within = [r for r in told[1:] if r.done is not None]
+    counts = [r.done for r in within]
+    assert counts.count(1) == len(found.steps) == 2  # a search for each step
+    assert all(b in (1, a + 1) for a, b in pairwise(counts))
+    assert all(r.objective is not None and r.objective > 0.0 for r in within)
 
 
 def test_moduli_and_logarithms_are_inverse() -> None:

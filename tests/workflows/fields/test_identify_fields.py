@@ -25,7 +25,7 @@ from naibu.identification.from_fields.uncertainty import Uncertainty
 from naibu.identification.verdict import Explanation
 from naibu.io.displacement_fields import read_field, write_field
 from naibu.io.images import read_volume, write_volume
-from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
+from naibu.validation.specimens.quadratic_body import UNKNOWN, QuadraticBody, Solved
 from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced, moved_borders, sizes_of_voxels
 from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions
 from naibu.workflows.fields.known_zones import parse_known_zones
@@ -311,6 +311,17 @@ def test_a_map_without_a_known_zone_is_relative_to_its_largest_region(folder: Pa
     assert run.relative and run.unit == "multiples of the largest region" and "kPa" not in " ".join(run.notes)
     assert "largest region" in (folder / "map" / "report.html").read_text() and run.body.unit == run.unit
     assert not [name for name in TEXTS if "kPa" in (folder / "map" / name).read_text()]
+
+
+def test_a_map_of_few_points_has_fewer_cells(folder: Path) -> None:
+    """Of 2500 cells, whatever the points, 500 particles took minutes for a map that shows nothing finer than they are apart."""
+    field = read_field(folder / "field.h5")
+    write_field(folder / "few.h5", DisplacementField.from_arrays(field.points[:300], field.vectors[:300], sd_mm=SD_MM))
+    run = identify_fields(folder / "few.h5", mask=folder / "labels.mha", each_cell=True, law="linear")
+    assert run.body.mesh.n_cells == 729
+    assert run.estimate.zones.count == 1 and "no difference of stiffness can be told" in " ".join(run.notes)
+    _, ((low, high),) = run.estimate.intervals()
+    assert low < UNKNOWN[1] < high
 
 
 def test_multiples_of_a_zone_are_nowhere_told_in_kilopascals(folder: Path) -> None:

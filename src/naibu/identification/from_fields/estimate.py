@@ -135,7 +135,7 @@ def identify_field(
     other_mesh : ndarray, shape (2 count,), optional
         ln mu, then ln(kappa / mu) of the zones as found on another mesh: what elements leave in doubt is at least by how much these differ.
     progress : callable, optional
-        Gets a report after every step, its stage in words (`naibu.core.progress`); the same words are in `FieldEstimate.steps`.
+        Gets a report after every step, its stage in words, which are in `FieldEstimate.steps` too; and counted ones within long steps.
 
     Raises
     ------
@@ -180,6 +180,7 @@ class _Recipe:
     def start(self, given: tuple[FloatArray, FloatArray] | None) -> Point:
         """Return where to begin: the given moduli, or those of the homogeneous body that fits best."""
         objective = Objective(bounds=self.bounds)
+        report_progress(self.progress, "finding how the loaded nodes move", done=0, total=1)
         if given is not None:
             return first_point(self.model, objective.clipped(logarithms(*(np.asarray(g, dtype=float) for g in given))))
         zones = self.model.zones
@@ -188,7 +189,7 @@ class _Recipe:
         shear = float(np.exp(np.log(known).mean())) if len(known) else 1.0
         ratio = 2.0 * (1.0 + START_POISSON_RATIO) / (3.0 * (1.0 - 2.0 * START_POISSON_RATIO))
         first = first_point(homogeneous, objective.clipped(np.log([shear, ratio])))
-        found = search(homogeneous, first, objective, SearchSettings(tolerance=1e-3))
+        found = search(homogeneous, first, objective, SearchSettings(tolerance=1e-3), progress=self.progress)
         young, poisson = young_and_poisson(found.point.theta)
         self.record(
             f"homogeneous start: Young's modulus {young[0]:.4g}{zones.unit}, Poisson's ratio {poisson[0]:.3f}, "
@@ -207,7 +208,7 @@ class _Recipe:
 
     def free(self, point: Point) -> FieldEstimate:
         """Fit the zones without a penalty."""
-        found = search(self.model, point, Objective(bounds=self.bounds))
+        found = search(self.model, point, Objective(bounds=self.bounds), progress=self.progress)
         self.record(
             f"fit of {self.model.zones.count} zones without penalty: misfit {found.point.misfit:.4g} after {found.iterations} iterations"
         )
@@ -227,7 +228,8 @@ class _Recipe:
             return estimate
         natural = weight_of_borders(graph)
         if weight == "discrepancy" and choice.met and choice.taken.weight > natural:  # regions are judged by probability: noise makes none
-            found = search(self.model, at.point, Objective(penalty, natural, self.bounds), SEARCH_AT_WEIGHT, rule=self._rule())
+            objective = Objective(penalty, natural, self.bounds)
+            found = search(self.model, at.point, objective, SEARCH_AT_WEIGHT, rule=self._rule(), progress=self.progress)
             self.record(f"{penalty.name} of weight {natural:.3g}, for regions: misfit {found.point.misfit:.4g}")
             choice = replace(choice, trials=(WeightTrial(natural, found, found.point.misfit, penalty.value(found.point.theta)),), chosen=0)
             at = self.model.linearised(self.model.evaluate(found.point.theta, found.point.states))
@@ -250,7 +252,7 @@ class _Recipe:
         def solve(weight: float, start: Found | None) -> WeightTrial:
             at = point if start is None else start.point
             first = self.model.evaluate(at.theta, at.states)
-            found = search(self.model, first, Objective(penalty, weight, self.bounds), SEARCH_AT_WEIGHT, rule=step)
+            found = search(self.model, first, Objective(penalty, weight, self.bounds), SEARCH_AT_WEIGHT, rule=step, progress=self.progress)
             done = WeightTrial(weight, found, found.point.misfit, penalty.value(found.point.theta))
             self.record(
                 f"{penalty.name} of weight {weight:.3g}: misfit {done.misfit:.4g} (noise alone: {self.model.n_free:.4g}), "
@@ -261,7 +263,7 @@ class _Recipe:
         def uniform() -> WeightTrial:
             one = self.model.with_zones(self.model.zones.of_one_material())
             start = one.evaluate(point.theta.reshape(2, -1).mean(axis=1), point.states)
-            found = search(one, start, Objective(bounds=self.bounds), SEARCH_AT_WEIGHT)
+            found = search(one, start, Objective(bounds=self.bounds), SEARCH_AT_WEIGHT, progress=self.progress)
             everywhere = self.model.evaluate(np.repeat(found.point.theta, self.model.zones.count), found.point.states)
             return WeightTrial(max(first, 2.0 * weight_of_borders(graph)), replace(found, point=everywhere), everywhere.misfit, 0.0)
 
@@ -322,7 +324,7 @@ class _Recipe:
         refined = refined if corrected is None else corrected.refined
         model = self.model.with_zones(refined.zones)
         start = model.evaluate(refined.theta, refined.point.states)
-        fitted = search(model, start, Objective(bounds=self.bounds)).point
+        fitted = search(model, start, Objective(bounds=self.bounds), progress=self.progress).point
         if corrected is not None:
             return self._estimate(model, model.evaluate(fitted.theta, fitted.states), Status.CONVERGED, refined, corrected)
         return self._sharp(refined.zones, fitted, refined)

@@ -58,7 +58,8 @@ if TYPE_CHECKING:
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
 BEYOND_KNOWN = 1e4  # times the stiffest, or part of the softest, known Young's modulus
-CELLS_OF_MAP = 2500  # of the model by default
+CELLS_OF_MAP = 2500  # of the model by default, where points are as many: finer cells than these are apart show nothing more
+LEAST_OF_MAP = 700  # cells, since maps of some hundred are searched with the whole Hessian, which takes longer
 POINTS_OF_CELL, LEAST_CELLS = 2, 64  # cells with fewer points leave to the motion of the surface what zones of uniform moduli would tell
 
 
@@ -161,9 +162,9 @@ def identify_fields(
     law : {"neo_hookean", "linear"}
         Finite or small strain.
     element_size_mm : float
-        Edge length of the cubes; 0 chooses it so that there are about 1200, or 2500 for a map; fewer where a cell
-        of zones would hold less than two points, more where a zone would share less than three quarters with its cubes, or where their
-        size leaves more in doubt of moduli than the measurement does (then up to 2800).
+        Edge length of the cubes; 0 chooses it so that there are about 1200; fewer where a cell would hold less than two points, more where
+        a zone would share less than three quarters with its cubes, or where their size leaves more in doubt of moduli than the measurement
+        does (then up to 2800). Of a map there are as many as points, but 700 at least and 2500 at most.
     unit, spacing_mm : str, sequence of float, optional
         Unit of fields that do not state theirs, or the size of a voxel along x, y, z, mm, of fields in voxels (see `naibu.io.read_field`).
     node_spacing : sequence of float, optional
@@ -194,8 +195,9 @@ def identify_fields(
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     measured = tuple((Path(p).stem, field) for p, field in zip(paths, read, strict=True))
     scanned = ScannedObject(inside, labels, names, measured, tuple(loaded))
-    most = max(int(field.valid.sum()) for field in read) // POINTS_OF_CELL
-    usual = CELLS_OF_MAP if each_cell else min(CELLS, most)
+    points = max(int(field.valid.sum()) for field in read)
+    most = points // POINTS_OF_CELL
+    usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else min(CELLS, most)
     size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
     sought = () if each_cell else set(names.values()) - set(stated.values)
     cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)

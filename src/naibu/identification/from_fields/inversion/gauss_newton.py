@@ -16,6 +16,7 @@ import scipy.sparse as sp
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import MAX_POISSON_RATIO
+from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point
 from naibu.identification.from_fields.inversion.regularization import Regularization
@@ -24,6 +25,7 @@ LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
 SHORTEST_FRACTION = 1e-3  # of a step, below which the search ends
 NEGLIGIBLE = 1e-9  # by how much a step must promise to lower half of chi squared to be worth taking
 ANCHOR = 1e-9  # of the Hessian's largest diagonal entry, on every modulus: what neither data nor penalty determine stays where it is
+SEARCHING = "searching moduli, iteration"
 
 
 CANNOT_FOLLOW = (
@@ -199,7 +201,13 @@ def exact_step(at: Linearised, objective: Objective) -> Step:
 
 
 def search(
-    model: FieldModel, start: Point, objective: Objective, settings: SearchSettings | None = None, *, rule: StepRule = exact_step
+    model: FieldModel,
+    start: Point,
+    objective: Objective,
+    settings: SearchSettings | None = None,
+    *,
+    rule: StepRule = exact_step,
+    progress: Progress | None = None,
 ) -> Found:
     """Lower the objective from a start until steps promise little.
 
@@ -216,10 +224,13 @@ def search(
     rule : callable
         Finds a step at a linearisation: `exact_step`, or for many zones
         `naibu.identification.from_fields.inversion.truncated_newton.truncated_step`.
+    progress : callable, optional
+        Gets a report before every iteration, which takes up to half a minute of thousands of cells.
     """
     chosen = settings or SearchSettings()
     point, value = start, objective.value(start)
     for iteration in range(chosen.max_iterations):
+        report_progress(progress, SEARCHING, done=iteration + 1, objective=value)
         at = model.linearised(point)
         step = rule(at, objective)
         if chosen.ended(step, value):

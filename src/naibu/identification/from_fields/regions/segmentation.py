@@ -268,7 +268,7 @@ def segment(
     bounds : Bounds
         Of the moduli.
     progress : callable, optional
-        Gets a report after every number of clusters.
+        Gets a report after every number of clusters, and of every iteration of a search.
 
     Raises
     ------
@@ -279,7 +279,7 @@ def segment(
     found: list[tuple[float, IntArray, Point, int]] = []
     for most in CLUSTERS:
         try:
-            labels, point, moved = _from_clusters(model, criterion, start, bounds, most)
+            labels, point, moved = _from_clusters(model, criterion, start, bounds, most, progress)
         except ConvergenceError:
             if most == CLUSTERS[-1] and not found:
                 raise
@@ -295,7 +295,7 @@ def segment(
     zones = joined(model.zones, labels)
     regions = model.with_zones(zones)
     point = _at(regions, point.theta.reshape(2, -1)[:, order].ravel(), point)
-    point = search(regions, point, Objective(bounds=bounds)).point
+    point = search(regions, point, Objective(bounds=bounds), progress=progress).point
     return Segmentation(labels, zones, point, max(CLUSTERS), moved)
 
 
@@ -339,7 +339,9 @@ def jump_costs(jump: FloatArray) -> FloatArray:
     return np.asarray(np.minimum(np.hypot(jump[0], BULK_WEIGHT * jump[1]), CLEAR))
 
 
-def _from_clusters(model: FieldModel, criterion: Criterion, start: Point, bounds: Bounds, most: int) -> tuple[IntArray, Point, int]:
+def _from_clusters(
+    model: FieldModel, criterion: Criterion, start: Point, bounds: Bounds, most: int, progress: Progress | None
+) -> tuple[IntArray, Point, int]:
     """Merge clusters, fit regions and mend their borders until nothing changes; returns regions, their fit, and how many zones moved."""
     graph = criterion.graph
     labels = clusters(graph, start.theta, most)
@@ -351,10 +353,10 @@ def _from_clusters(model: FieldModel, criterion: Criterion, start: Point, bounds
         quadratic = _scaled(fitted.linearised(point).concentrated(np.eye(len(point.theta))), criterion.scale)
         united, theta = merged(quadratic, point.theta, areas_between(graph, labels), criterion.weight, criterion.charge)
         before, labels = int(labels.max()), united[labels]
-        labels, point = _refitted(model, labels, theta, point, bounds)
+        labels, point = _refitted(model, labels, theta, point, bounds, progress)
         changed = 0
         if graph.count <= EXPLICIT and int(labels.max()) > 0:
-            labels, point, changed = _with_better_borders(model, criterion, labels, point, bounds)
+            labels, point, changed = _with_better_borders(model, criterion, labels, point, bounds, progress)
         moved += changed
         if not changed and before == int(labels.max()):
             break
@@ -377,22 +379,24 @@ def _scaled(quadratic: Concentrated, scale: float) -> Concentrated:
     return replace(quadratic, hessian=quadratic.hessian / scale, gradient=quadratic.gradient / scale)
 
 
-def _refitted(model: FieldModel, labels: IntArray, theta: FloatArray, near: Point, bounds: Bounds) -> tuple[IntArray, Point]:
+def _refitted(
+    model: FieldModel, labels: IntArray, theta: FloatArray, near: Point, bounds: Bounds, progress: Progress | None
+) -> tuple[IntArray, Point]:
     """Fit the moduli of regions to the measurements alone; regions that have no zone any more are left out."""
     kept, labels = np.unique(labels, return_inverse=True)
     regions = model.with_zones(joined(model.zones, labels))
     objective = Objective(bounds=bounds)
     start = _at(regions, objective.clipped(theta.reshape(2, -1)[:, kept].ravel()), near)
-    return labels.astype(np.int64), search(regions, start, objective, ROUGHLY).point
+    return labels.astype(np.int64), search(regions, start, objective, ROUGHLY, progress=progress).point
 
 
 def _with_better_borders(
-    model: FieldModel, criterion: Criterion, labels: IntArray, point: Point, bounds: Bounds
+    model: FieldModel, criterion: Criterion, labels: IntArray, point: Point, bounds: Bounds, progress: Progress | None
 ) -> tuple[IntArray, Point, int]:
     everywhere = _at(model, point.theta.reshape(2, -1)[:, labels].ravel(), point)
     quadratic = _scaled(model.linearised(everywhere).concentrated(np.eye(2 * criterion.graph.count)), criterion.scale)
     found, moves = border_moves(criterion.graph, labels, point.theta, quadratic, criterion.weight)
     if not moves:
         return labels, point, 0
-    labels, point = _refitted(model, found, point.theta, point, bounds)
+    labels, point = _refitted(model, found, point.theta, point, bounds, progress)
     return labels, point, moves
