@@ -233,8 +233,9 @@ class LocalRegression:
 
     In every round the lattice is simulated on both sides along random orthogonal directions, as far away as is typical of the covariance,
     but no farther than the linear model holds. Both steps of the regression are simulated, the better one is taken. Once steps stay within
-    the covariance and chi-squared falls no longer, fine steps of time at a few points tell what to add to residuals of long ones. What is
-    left of the way that the last regression points is a deviation: a search may have ended far away along what the data do not tell.
+    the covariance and chi-squared falls no longer, fine steps of time at a few points tell what to add to residuals of long ones, again
+    where it moved on after that. The last regression has half as many points to spare as there are values. What is left of the way that it
+    points is a deviation: a search may have ended far away along what the data do not tell.
 
     Attributes
     ----------
@@ -277,10 +278,11 @@ class LocalRegression:
             corrected, self.rounds = corrected or due, self.rounds + 1
             fit = self._fit(spread)
             sd = np.sqrt(np.diag(fit.covariance))
-            near = bool((np.abs(fit.steps) <= CLOSE * sd).all()) and fit.free >= p // 2
-            near = near and np.trace(np.linalg.solve(spread, _within(SPREAD**2 * fit.covariance, self._widest))) < WIDER**2 * p
+            still = bool((np.abs(fit.steps) <= CLOSE * sd).all()) and fit.free > 0  # else what it leaves is not known
+            still = still and np.trace(np.linalg.solve(spread, _within(SPREAD**2 * fit.covariance, self._widest))) < WIDER**2 * p
             end = self.theta + fit.way
-            near = self._move(fit, spread) < WORTH * p and near
+            still = self._move(fit, spread) < WORTH * p and still
+            near, corrected = still and fit.free >= p // 2, still and corrected
             self.covariance = fit.covariance
             if self.rounds >= ROUNDS or (near and corrected):
                 self.settled = near and corrected
@@ -288,7 +290,7 @@ class LocalRegression:
                 most = unsettled_covariance(self.theta, self.centre, self.prior_sd)
                 covariance = about(fit.covariance, end - self.theta, most)
                 return EvaluatedPoint(self.theta, residual, self.points.parts(fit.slopes)), covariance
-            due = near
+            due = still and not corrected  # even where the regression lacks points: the next one has more
             self._adapt(fit.jumps)
 
     def _adapt(self, jumps: float) -> None:

@@ -13,7 +13,7 @@ soft, at the expense of smaller indenters.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -58,6 +58,7 @@ class ContactSurface:
     area: FloatArray
     spread: FloatArray
     parameters: LatticeParameters
+    _rules: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict, repr=False)
 
     @classmethod
     def of(cls, lattice: Lattice, parameters: LatticeParameters) -> ContactSurface:
@@ -96,8 +97,10 @@ class ContactSurface:
         """Return shape functions (q, 4) and weights (f, q), mm2."""
         if self.faces.shape[1] == 1:
             return np.array([[1.0, 0.0, 0.0, 0.0]]), self.area[:, None].copy()
-        shape, weight = face_quadrature(self.points, self.faces, order)
-        return np.pad(shape, ((0, 0), (0, 4 - shape.shape[1]))), weight
+        if order not in self._rules:
+            shape, weight = face_quadrature(self.points, self.faces, order)
+            self._rules[order] = np.pad(shape, ((0, 0), (0, 4 - shape.shape[1]))), weight
+        return self._rules[order]
 
     def thickness(self, geometry: IndenterGeometry) -> FloatArray:
         """Return the thickness of the foundations (f,) before an indenter presses them, in lengths of the elements."""
