@@ -7,6 +7,7 @@ ever; what they need is therefore asked for before they are loaded. Only POSIX s
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import sys
 from pathlib import Path
@@ -42,6 +43,17 @@ def available_memory_mb() -> float:
         limit, used = (Path(f"/sys/fs/cgroup/memory.{name}").read_text(encoding="ascii").strip() for name in ("max", "current"))
         room += [(float(limit) - float(used)) / MEGABYTE] if limit != "max" else []
     return min(room)
+
+
+def return_freed_memory() -> None:
+    """Give memory that was freed back to the system, where the C library can: glibc keeps arrays of up to 32 MB for later ones.
+
+    Larger arrays are never kept: what lies free among small ones is no room for them.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    with contextlib.suppress(OSError, AttributeError):  # another C library has no such function
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 def require_address_space(needed_mb: float, what: str) -> None:
