@@ -58,7 +58,7 @@ class ContactSurface:
     area: FloatArray
     spread: FloatArray
     parameters: LatticeParameters
-    _rules: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict, repr=False)
+    _rules: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict, init=False, repr=False)
 
     @classmethod
     def of(cls, lattice: Lattice, parameters: LatticeParameters) -> ContactSurface:
