@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import uniform_filter1d
 
-from naibu.identification.lattice_calibration.intervals.local_regression import WORTH, LocalRegression, Pair, Regression, regression
+from naibu.identification.lattice_calibration.intervals.local_regression import (
+    WORTH,
+    LocalRegression,
+    Pair,
+    Regression,
+    _of_another,
+    regression,
+)
 from naibu.identification.lattice_calibration.least_squares import unsettled_covariance
 from naibu.identification.lattice_calibration.simulated_points import SimulatedPoints
 
@@ -129,3 +136,12 @@ def test_where_a_search_did_not_come_to_rest_intervals_hold_what_the_prior_holds
         theta = centre + away
         half = 1.96 * np.sqrt(np.diag(unsettled_covariance(theta, centre, prior_sd)))
         assert (np.mean(np.abs(truth - theta) < half, axis=0) > 0.945).all()
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_what_few_errors_tell_of_another_one_holds_it_in_95_of_100(count: int) -> None:
+    drawn = np.random.default_rng(8).standard_normal((200_000, count + 1))
+    known, other = drawn[:, :-1], drawn[:, -1]
+    about = ((known - known.mean(axis=1, keepdims=True)) ** 2).sum(axis=1)
+    half = 1.96 * np.sqrt(about * (1.0 / (count - 1) + _of_another(count)))
+    assert np.mean(np.abs(other - known.mean(axis=1)) < half) == pytest.approx(0.95, abs=0.002)

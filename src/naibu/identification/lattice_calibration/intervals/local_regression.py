@@ -18,6 +18,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
+import scipy.stats
 from scipy.ndimage import uniform_filter1d
 
 from naibu.core.arrays import FloatArray
@@ -155,7 +156,7 @@ def regression(
     slope = told @ slopes.T @ (weights * level) + prior @ (theta - centre)
     gain = covariance @ told @ (slopes.T * weights)
     steps = _limited(hessian, slope), _limited(apparent + prior, slopes.T @ (weights * level) + prior @ (theta - centre))
-    for rest, share in (*parts, (_lacking(level, noise, points), 1.0)):
+    for rest, share in (*parts, (further, _of_another(len(further))), (_lacking(level, noise, points), 1.0)):
         moved = rest @ gain.T
         covariance = covariance + share * moved.T @ moved
     limited = about(covariance, np.zeros(p), unsettled_covariance(theta, centre, prior_sd))
@@ -199,6 +200,18 @@ def _lacking(level: FloatArray, noise: FloatArray, points: int) -> FloatArray:
     found = np.zeros((STRETCHES, len(level)))
     found[np.arange(count) * STRETCHES // max(count, 1), points + np.arange(count)] = level[points:]
     return found if count and noise[-1] > 1.0 else found[:0]
+
+
+def _of_another(count: int) -> float:
+    """Return what the sum of squares about the mean of so few errors of the model tells of another one, beside its mean square.
+
+    What was measured has an error of its own, which that mean does not tell; and how much errors vary is known from few of them. The
+    variance is such that its 95 % interval is that of Student's distribution.
+    """
+    if count < 2:
+        return 0.0
+    quantile = float(scipy.stats.t.ppf(0.975, count - 1) / scipy.stats.norm.ppf(0.975))
+    return ((1.0 + 1.0 / count) * quantile**2 - 1.0) / (count - 1)
 
 
 def _spurious(design: FloatArray, products: FloatArray, mean: FloatArray) -> FloatArray:
