@@ -39,6 +39,11 @@ ONE_MATERIAL = (
     "One material explains the measurement: no difference of stiffness can be told from its noise, which does not mean that there is none."
 )
 
+FEW_POINTS = (
+    "There are fewer points than elements: they leave the motion of the surface to the assumption that it is smooth, which draws Poisson's "
+    "ratio towards 0.5. Nothing is said of Poisson's ratio; use larger elements to know more."
+)
+
 
 def identify_relative_map(
     mesh: Mesh,
@@ -70,7 +75,8 @@ def identify_relative_map(
     lame, shear = lame_parameters(1.0, POISSON_RATIO)
     start = np.full(mesh.n_cells - 1, lame), np.full(mesh.n_cells - 1, shear)
     found = identify_field(mesh, load_cases, zones_beside(mesh, cell), law=law, bounds=bounds, start=start, progress=progress)
-    return _without_reference(_relative(found), cell)
+    few = max(len(case.field.points) for case in load_cases) < mesh.n_cells
+    return _without_reference(_relative(found, poisson_known=not few), cell)
 
 
 def middle_cell(mesh: Mesh) -> int:
@@ -113,7 +119,17 @@ def relative_to(found: Uncertainty, theta: FloatArray, zone: int) -> Uncertainty
     return Uncertainty(free, covariance, found.stretch)
 
 
-def _relative(found: FieldEstimate) -> FieldEstimate:
+def without_poisson(found: Uncertainty) -> Uncertainty:
+    """Return the uncertainty of moduli where nothing is known of kappa / mu."""
+    k = len(found.covariance) // 2
+    covariance = found.covariance.copy()
+    covariance[k:, :] = covariance[:, k:] = 0.0
+    bulk = np.arange(k, 2 * k)
+    covariance[bulk, bulk] = np.inf
+    return Uncertainty(found.information, covariance, found.stretch)
+
+
+def _relative(found: FieldEstimate, *, poisson_known: bool = True) -> FieldEstimate:
     """Divide moduli by that of the largest zone, or by the median of a map without zones that have intervals."""
     volume = _volumes(found)
     logarithm = np.log(found.young_modulus)
@@ -127,6 +143,7 @@ def _relative(found: FieldEstimate) -> FieldEstimate:
     zone = int(np.argmax(volume))
     unit = float(logarithm[zone])
     theta, uncertainty = _divided(found.theta, unit), relative_to(found.uncertainty, found.theta, zone)
+    uncertainty = uncertainty if poisson_known else without_poisson(uncertainty)
     others = tuple(replace(one, theta=_divided(one.theta, _of_unit(one, found.theta, zone))) for one in found.assumptions)
     regularized = found.regularized and (found.regularized[0] / np.exp(unit), found.regularized[1])
     assert found.verdict is not None  # of regions that were fitted without a penalty
@@ -134,7 +151,7 @@ def _relative(found: FieldEstimate) -> FieldEstimate:
     found = replace(found, verdict=judged)
     return replace(
         found, theta=theta, uncertainty=uncertainty, assumptions=others, regularized=regularized, budget=None,
-        identifiability=_in_words(found, theta, uncertainty, others),
+        identifiability=(*_in_words(found, theta, uncertainty, others), *(FEW_POINTS,) * (not poisson_known)),
     )  # fmt: skip
 
 

@@ -287,7 +287,8 @@ def segment(
         found.append((criterion.value(labels, point), labels, point, moved))
         text = f"{most} clusters made {int(labels.max()) + 1} regions, misfit {point.misfit:.4g}"
         report_progress(progress, text, done=len(found), total=len(CLUSTERS), objective=point.misfit)
-        if float(np.ptp(start.theta.reshape(2, -1), axis=1).max()) < LIKE:  # there is nothing to gather otherwise
+        alone = int(labels.max()) == 0 and 0.5 * (point.misfit - start.misfit) / criterion.scale < criterion.charge
+        if alone or float(np.ptp(start.theta.reshape(2, -1), axis=1).max()) < LIKE:  # there is nothing to gather otherwise
             break
     _, labels, point, moved = min(found, key=lambda f: f[0])
     order = np.argsort(-np.bincount(labels, graph.volume), kind="stable")
