@@ -309,7 +309,7 @@ def _correlated(
     found = correlate_volumes(reference, deformed, mask=masks[0], deformed_mask=masks[1], progress=progress)
     parts = correlated_parts(reference, deformed, inside, found, progress=progress)
     if not parts:
-        return measured_by(found, reference, inside)
+        return measured_by(found, reference, inside, reuse=True)
     rest = inside & ~np.logical_or.reduce([part for part, _ in parts])
     each = [*parts, (rest, found)] if rest.any() else parts
     joined = _joined([measured_by(own, reference, part) for part, own in each], len(parts), inside)
@@ -358,7 +358,7 @@ def _worst_of(facts: Sequence[dict[str, float | int | str]]) -> dict[str, float 
     return joined
 
 
-def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) -> MeasuredDisplacement:
+def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray, *, reuse: bool = False) -> MeasuredDisplacement:
     """Return the displacement that volume correlation found, with the facts of its measurement, at the voxels of the object.
 
     Parameters
@@ -369,6 +369,8 @@ def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) 
         That grid.
     inside : ndarray, shape (nz, ny, nx), bool
         Voxels of the object.
+    reuse : bool
+        Whether the vectors of `found` may be overwritten, which saves the memory of a copy.
     """
     return_freed_memory()  # what the search has freed: the fields take some hundred bytes a voxel
     unconverged, cells = int((~found.converged).sum()), int(np.isfinite(found.cell_covariance[..., 0, 0]).sum())
@@ -382,7 +384,8 @@ def measured_by(found: CorrelationResult, reference: Volume, inside: BoolArray) 
     }
     valid = found.valid & inside
     outside = ~valid
-    vectors, gradient = found.displacement.vectors.copy(), found.gradient(np.float32)
+    vectors = found.displacement.vectors if reuse else found.displacement.vectors.copy()
+    gradient = found.gradient(np.float32)
     for values in (vectors, gradient):
         values[outside] = np.nan
     covariance = found.covariance()

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, Int32Array
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
+from naibu.core.memory import return_freed_memory
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.common_content import CommonContent
@@ -319,6 +320,7 @@ def collected(
     strain_sd = np.sqrt(
         strain_variance(fit, c, samples, bias) + hidden[1] + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
     )
+    return_freed_memory()
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
     valid = np.zeros(volume.shape, dtype=bool)
     valid[box] = _answered(fit, content)
