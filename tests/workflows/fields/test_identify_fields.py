@@ -327,6 +327,8 @@ def test_a_map_of_few_points_has_fewer_cells(folder: Path) -> None:
     _, ((low, high),) = run.estimate.intervals()
     assert low <= -1.0 and UNKNOWN[1] < high  # 0.4984 to 0.4998 was told of a gel of 0.45 with 501 particles
     assert "fewer points than elements" in " ".join(run.notes)
+    judged = run.estimate.verdict
+    assert judged is not None and judged.ok and "but 300 points for 729 cells" in judged.sentence  # multiples can be used, moduli could not
 
 
 def test_multiples_of_a_zone_are_nowhere_told_in_kilopascals(folder: Path) -> None:
