@@ -19,7 +19,6 @@ from naibu.identification.from_fields.assumptions import Assumption
 from naibu.identification.from_fields.estimate import TOO_COARSE, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
-from naibu.identification.from_fields.forward.forward_model import whitening
 from naibu.identification.from_fields.forward.load_cases import (
     KNOWN,
     POISSON_RATIO,
@@ -33,7 +32,7 @@ from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.inversion.regularization import cell_volumes, inner_faces
 from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.uncertainty import Uncertainty, intervals, young_and_poisson_slopes
-from naibu.identification.from_fields.verdict import of_residuals, too_few_points
+from naibu.identification.from_fields.verdict import told_points
 from naibu.identification.from_fields.verdict_within_cells import with_limits
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
@@ -77,11 +76,9 @@ def identify_relative_map(
     lame, shear = lame_parameters(1.0, POISSON_RATIO)
     start = np.full(mesh.n_cells - 1, lame), np.full(mesh.n_cells - 1, shear)
     found = identify_field(mesh, load_cases, zones_beside(mesh, cell), law=law, bounds=bounds, start=start, progress=progress)
-    few = found.verdict is not None and too_few_points(found.verdict)
-    if found.verdict is not None and few:
-        stated = not any(whitening(case.field, case.name)[2] for case in load_cases)
-        found = replace(found, verdict=of_residuals(found.verdict, noise_stated=stated))
-    return _without_reference(_relative(found, poisson_known=not few), cell)
+    points = max(int(case.field.valid.sum()) for case in load_cases)
+    few = told_points(points, mesh.n_cells) if points < mesh.n_cells else ""
+    return _without_reference(_relative(found, few), cell)
 
 
 def middle_cell(mesh: Mesh) -> int:
@@ -134,8 +131,11 @@ def without_poisson(found: Uncertainty) -> Uncertainty:
     return Uncertainty(found.information, covariance, found.stretch)
 
 
-def _relative(found: FieldEstimate, *, poisson_known: bool = True) -> FieldEstimate:
-    """Divide moduli by that of the largest zone, or by the median of a map without zones that have intervals."""
+def _relative(found: FieldEstimate, few: str = "") -> FieldEstimate:
+    """Divide moduli by that of the largest zone, or by the median of a map without zones that have intervals.
+
+    Where points are too `few`, which is said in words, nothing is said of Poisson's ratio.
+    """
     volume = _volumes(found)
     logarithm = np.log(found.young_modulus)
     if found.uncertainty is None:
@@ -148,16 +148,15 @@ def _relative(found: FieldEstimate, *, poisson_known: bool = True) -> FieldEstim
     zone = int(np.argmax(volume))
     unit = float(logarithm[zone])
     theta, uncertainty = _divided(found.theta, unit), relative_to(found.uncertainty, found.theta, zone)
-    uncertainty = uncertainty if poisson_known else without_poisson(uncertainty)
+    uncertainty = without_poisson(uncertainty) if few else uncertainty
     others = tuple(replace(one, theta=_divided(one.theta, _of_unit(one, found.theta, zone))) for one in found.assumptions)
     regularized = found.regularized and (found.regularized[0] / np.exp(unit), found.regularized[1])
     assert found.verdict is not None  # of regions that were fitted without a penalty
-    kept = "" if poisson_known else found.verdict.limits
-    judged = with_limits(replace(found.verdict, limits=kept), found.zones.names, None, intervals(theta, uncertainty)[0], "")
+    judged = with_limits(replace(found.verdict, limits=few), found.zones.names, None, intervals(theta, uncertainty)[0], "")
     found = replace(found, verdict=judged)
     return replace(
         found, theta=theta, uncertainty=uncertainty, assumptions=others, regularized=regularized, budget=None,
-        identifiability=(*_in_words(found, theta, uncertainty, others), *(FEW_POINTS,) * (not poisson_known)),
+        identifiability=(*_in_words(found, theta, uncertainty, others), *(FEW_POINTS,) * bool(few)),
     )  # fmt: skip
 
 
