@@ -22,10 +22,10 @@ from pathlib import Path
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.core.thread_priority import scheduled_first
 from naibu.mechanics import Assembler, LatticeEngine, box_mask, classic_lattice, elements, lattice_mesh, lattice_parameters, material
 from naibu.meshing import boundary_faces, box, to_tetra
 from naibu.simulation import FiniteElementBody, ForceLimits, LatticeBody, SimulatedDevice
+from naibu.simulation.haptics.thread_priority import scheduled_first
 from naibu.workflows import DeviceRecord, TouchableModel, drive_live_simulation, touched_loop
 from naibu.workflows.interactive.touchable_models import LATTICE_STEP_S, LATTICE_TOLERANCE
 

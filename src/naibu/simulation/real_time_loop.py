@@ -10,9 +10,9 @@ from contextlib import nullcontext
 from dataclasses import dataclass, field
 
 from naibu.core.errors import NaibuError
-from naibu.core.thread_priority import REST_S, scheduled_first
 from naibu.simulation.frame import Frame
 from naibu.simulation.haptics.haptic_loop import HapticHand, require_haptic_steps
+from naibu.simulation.haptics.thread_priority import REST_S, scheduled_first
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
 
 MEMORY_S = 1.0  # over which rates are averaged
@@ -61,7 +61,7 @@ class RealTimeLoop:
         Time and waiting, s.
     hand : HapticHand, optional
         A haptic device that leads the tool; frames are then single steps, of which one is shown every 1/60 s, and the thread is scheduled
-        first where the system permits it (`naibu.core.thread_priority.scheduled_first`).
+        first where the system permits it (`naibu.simulation.haptics.thread_priority.scheduled_first`).
 
     Raises
     ------

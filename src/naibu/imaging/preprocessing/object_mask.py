@@ -9,7 +9,7 @@ from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from naibu.core.volume import Volume
-from naibu.imaging.preprocessing.aerated_tissue import aerated_tissue, meets_body
+from naibu.imaging.preprocessing.aerated_tissue import aerated_tissue, meets_body, summed
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
 from naibu.imaging.preprocessing.field_of_view import Box, in_box
 from naibu.imaging.preprocessing.pixel_padding import padding_as_air
@@ -184,7 +184,7 @@ def _with_cavities(bright: BoolArray, volume: Volume) -> BoolArray:
     voxel = max((bright.size * float(np.prod(volume.spacing_mm)) / THROAT_VOXELS) ** (1 / 3), float(volume.spacing_mm.min()))
     stride = np.maximum(np.round(voxel / volume.spacing_mm[::-1]), 1).astype(int)
     # coarse voxels are bright where any of theirs is: thin walls stay closed
-    blocked = _blocks(~outside, stride)
+    blocked = summed(~outside, stride) > 0
     cavities = aerated_tissue(padding_as_air(volume.values), bright, outside, stride)
     cavities |= _through_throats(blocked | cavities, volume.spacing_mm[::-1] * stride)
     if cavities.any():
@@ -225,10 +225,3 @@ def _from_outside(free: BoolArray, air: BoolArray) -> BoolArray:
     reached = np.zeros(n + 1, dtype=bool)
     reached[labels[seeds]] = True
     return np.asarray(reached[labels])
-
-
-def _blocks(values: BoolArray, stride: IntArray) -> BoolArray:
-    """Return which blocks of voxels hold a true one."""
-    padded = np.pad(values, [(0, int(-n % s)) for n, s in zip(values.shape, stride, strict=True)], mode="edge")
-    nz, ny, nx = (n // s for n, s in zip(padded.shape, stride, strict=True))
-    return np.asarray(padded.reshape(nz, stride[0], ny, stride[1], nx, stride[2]).any(axis=(1, 3, 5)))

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Self
 
-from naibu.core.thread_priority import REST_S, scheduled_first
 from naibu.simulation.haptics.haptic_loop import HapticHand
 from naibu.simulation.haptics.local_contact import LocalContact
+from naibu.simulation.haptics.thread_priority import REST_S, scheduled_first
 from naibu.simulation.interactive_simulation import InteractiveSimulation
 from naibu.simulation.real_time_loop import RealTimeLoop
 

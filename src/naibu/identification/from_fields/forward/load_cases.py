@@ -13,6 +13,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+from naibu.meshing.surface import boundary_nodes
 
 KNOWN = -1
 POISSON_RATIO, POISSON_RATIO_SD = 0.45, 0.03  # of a known material of which only Young's modulus is stated
@@ -200,3 +201,11 @@ class Zones:
         for full, given in zip(out, (lame_lambda, shear_modulus), strict=True):
             full[unknown] = np.asarray(given, dtype=float)[self.of_cell[unknown]]
         return out
+
+
+def is_surface_sought(mesh: Mesh, load_cases: Sequence[FieldLoadCase]) -> bool:
+    """Return whether forces may act on the whole surface of a body in space, whose motion is sought, in a load case."""
+    if mesh.dimension != 3:
+        return False
+    surface = boundary_nodes(mesh)
+    return any(bool(case.loaded[surface].all()) for case in load_cases)

@@ -22,11 +22,10 @@ from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import FieldElements, FieldLaw, LawName, computed_mesh, field_law
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, loaded_from_rest
-from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones, is_surface_sought
 from naibu.identification.from_fields.forward.loaded_components import BLOCK, BoundaryPreconditioner, alike, conjugate_gradients
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
-from naibu.meshing.surface import boundary_faces
 
 REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
 OUTDATED = (
@@ -104,10 +103,7 @@ class FieldModel:
     @property
     def surface_sought(self) -> bool:
         """Whether forces may act on the whole surface of a body in space, whose motion is sought, in a load case."""
-        if self.mesh.dimension != 3:
-            return False
-        surface = np.unique(boundary_faces(self.mesh).faces)
-        return any(bool(o.load_case.loaded[surface].all()) for o in self.observed)
+        return is_surface_sought(self.mesh, [o.load_case for o in self.observed])
 
     @property
     def n_data(self) -> int:

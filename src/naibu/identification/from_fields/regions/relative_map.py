@@ -26,6 +26,7 @@ from naibu.identification.from_fields.forward.load_cases import (
     FieldLoadCase,
     KnownRegion,
     Zones,
+    is_surface_sought,
 )
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
@@ -77,7 +78,7 @@ def identify_relative_map(
     start = np.full(mesh.n_cells - 1, lame), np.full(mesh.n_cells - 1, shear)
     found = identify_field(mesh, load_cases, zones_beside(mesh, cell), law=law, bounds=bounds, start=start, progress=progress)
     points = max(int(case.field.valid.sum()) for case in load_cases)
-    few = told_points(points, mesh.n_cells) if points < mesh.n_cells else ""
+    few = told_points(points, mesh.n_cells) if points < mesh.n_cells and is_surface_sought(mesh, load_cases) else ""
     return _without_reference(_relative(found, few), cell)
 
 

@@ -155,8 +155,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
     (geometry, axes), centres, friction, _, form = indenters
     corners, _, foundation, shapes, weights, first, rule = surface
     _, _, compression, extension, traction, multiplier, thickness = history
-    linear, found = points
-    (at, speed), share, (across, slip, d, q, m, n), none, _ = room
+    (linear, found), ((at, speed), share, (across, slip, d, q, m, n), none, _) = points, room
     wrong, wrong_friction, total, limits = 0.0, 0.0, 0.0, 0.0
     for entry in range(count):
         k, f = lists[0][entry], lists[1][entry]

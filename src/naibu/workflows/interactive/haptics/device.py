@@ -12,9 +12,9 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray, require_positive, require_within
 from naibu.core.errors import InputError
-from naibu.core.thread_priority import scheduled_first
 from naibu.simulation.haptics.haptic_loop import STALE
 from naibu.simulation.haptics.simulated_device import SimulatedDevice
+from naibu.simulation.haptics.thread_priority import scheduled_first
 from naibu.workflows.interactive.haptics.endpoint import LOOPBACK
 from naibu.workflows.interactive.haptics.packets import FORCE, pose_bytes, read_force
 

@@ -8,8 +8,8 @@ import threading
 
 import pytest
 
-from naibu.core import thread_priority
-from naibu.core.thread_priority import scheduled_first
+from naibu.simulation.haptics import thread_priority
+from naibu.simulation.haptics.thread_priority import scheduled_first
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="other systems keep their schedule")
 
