@@ -110,6 +110,24 @@ def test_contact_is_not_forgotten() -> None:
     assert made.run(replace(pressed, contact=None), 1).state.contact is None
 
 
+def test_a_ball_that_comes_back_to_where_it_pressed_is_borne_again() -> None:
+    """What nodes bore of it has faded to hardly anything meanwhile, by a factor in every step, and is no different from nothing."""
+    made = engine()
+    session = made.session(constrained=BOTTOM, indenters=[BALL])
+    for speed, steps in ((-50.0, 100), (100.0, 100), (0.0, 400)):
+        session.step(motions=[IndenterVelocity((0.0, 0.0, speed))], steps=steps)
+    assert not session.forces().indenters.any()
+    left = session.state()
+    assert left.contact is not None and left.contact.multiplier.max() > 0.0
+    nothing = replace(left, contact=replace(left.contact, multiplier=np.zeros_like(left.contact.multiplier)))
+    back = []
+    for begun in (left, nothing):
+        session.restore(begun)
+        back.append(session.step(motions=[IndenterVelocity((0.0, 0.0, -50.0))], steps=200).indenters[:, 0, 2])
+    assert back[1].min() < -100.0
+    np.testing.assert_allclose(back[0], back[1], atol=1e-3 * abs(back[1].min()))
+
+
 def test_a_state_goes_in_and_out() -> None:
     made = engine()
     session = made.session(indenters=[FLOOR, BALL])

@@ -11,6 +11,7 @@ LEAST_FACING = 0.01
 # of the width of a cell times what the slope changes by over it: mean gap over that at the point, beside the lowest point of an indenter;
 # and by how much earlier a cell begins to be covered than it is, so that it is not so at once
 BESIDE, EARLY = 1.0 / 24.0, 1.0 / 16.0
+LEAST_REACH = 1e-8  # of the width of a cell: below it the difference of two depths is that of their rounding
 NEAR = 0.1  # of the width of a cell that looks at a flat indenter: it has what is as near as that
 UPRIGHT = 0.75  # width of the cells of a face that stands upright on an indenter: Gauss points lie nearer to its edge than they are wide
 
@@ -54,7 +55,7 @@ def pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-d
     """
     mean, part = covered(depth, slope, width, curvature)
     borne = facing(slope, curvature)
-    if reach <= 0.0:
+    if reach <= LEAST_REACH * width:
         return mean, borne * part, part
     whole, steep = covered(depth + borne * reach, slope, width, curvature)
     return mean, (whole - mean) / reach, steep
