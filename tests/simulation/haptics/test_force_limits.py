@@ -65,6 +65,23 @@ def test_an_environment_that_drives_the_hand_gives_no_more_than_the_bound(gain: 
     assert given[1e12] > 100_000.0
 
 
+def test_a_device_that_got_all_that_the_bound_permits_feels_again_what_it_presses() -> None:
+    """To and fro against a wall: what it puts in from then on comes back, and nothing besides."""
+    limits = ForceLimits()
+    controller, limiter = PassivityController(limits, 500.0), StepLimiter(limits.step_mn)
+    work, force, forces = limits.energy_mn_mm, 0.0, []
+    for k in range(3000):
+        time = 1e-3 * k
+        position, velocity = -np.sin(6.0 * time), -6.0 * np.cos(6.0 * time)
+        work = min(work + force * 1e-3 * velocity, limits.energy_mn_mm)  # as the device sees to
+        controller.observe(-work)
+        limiter.forget()
+        moving, wall = np.array([velocity, 0.0, 0.0]), np.array([-200.0 * min(position, 0.0), 0.0, 0.0])
+        force = limiter.limited(controller.controlled(wall, moving, 1e-3))[0]
+        forces.append(force)
+    assert max(forces[-1000:]) > 150.0
+
+
 def test_an_environment_that_takes_energy_is_left_alone() -> None:
     controller = PassivityController(ForceLimits(), 500.0)
     force, velocity = np.array([-500.0, 20.0, 0.0]), np.array([40.0, 0.0, 0.0])

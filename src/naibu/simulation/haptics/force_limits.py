@@ -10,6 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray, require_positive
 
 MOST_OPEN = 256  # answers whose forces are remembered
+TAKEN_BACK = 0.01  # of the bound, which damping gets back where nothing is left: at nothing no force could begin that takes energy in
 RESERVED = 0.5  # of the energy that is left is used: the device may get faster before the force is taken back
 CONFIRMED_AFTER = 3  # steps in which an answer usually gets to the device and is confirmed
 
@@ -84,14 +85,13 @@ class PassivityController:
         """Return a force (3,), mN, reduced where a device at a velocity (3,), mm/s, would get more energy than there is.
 
         No force exceeds that of the coupling when it has stored what is left, and the energy that passes while the force is taken back at
-        its limited rate is counted, too. Where nothing is left, a damping takes back what was handed out.
+        its limited rate is counted, too. Where nothing is left, a damping takes back what was handed out, and a little more.
         """
         speed = float(np.linalg.norm(velocity))
         left = self.absorbed + self.limits.energy_mn_mm
         if left <= 0.0:
-            return (
-                np.asarray(-min(-left / (speed * step_s), self.limits.damping * speed) * velocity / speed) if speed > 0.0 else np.zeros(3)
-            )
+            lack = TAKEN_BACK * self.limits.energy_mn_mm - left
+            return np.asarray(-min(lack / (speed * step_s), self.limits.damping * speed) * velocity / speed) if speed > 0.0 else np.zeros(3)
         size = float(np.linalg.norm(force))
         kept = min(1.0, np.sqrt(2.0 * self.stiffness * left) / size) if size > 0.0 else 1.0
         along = kept * float(force @ velocity) / speed if speed > 0.0 else 0.0
