@@ -98,7 +98,7 @@ class DrawnMotions:
         all_changed, all_followed, total = [], [], np.zeros((size, size))
         for k in range(draws):
             changed = _changed_derivatives(at, [u[:, k] for u in moved])
-            pulls = [o.operator.T @ (o.operator @ u) for o, u in zip(observed, changed, strict=True)]
+            pulls = [o.information @ u for o, u in zip(observed, changed, strict=True)]
             cross = at.adjoint(pulls)[1]
             followed = at.loaded_solved(cross)
             total += sum(u.T @ p - c.T @ x for u, p, c, x in zip(changed, pulls, cross, followed, strict=True))

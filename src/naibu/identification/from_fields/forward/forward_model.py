@@ -50,6 +50,8 @@ class Observed:
         The load case, on the nodes on which equilibrium is computed.
     operator : csr_matrix, shape (q, n d)
         From nodal displacements to whitened data, 1/mm.
+    information : csr_matrix, shape (n d, n d)
+        The operator's transpose times the operator, 1/mm^2.
     data : ndarray, shape (q,)
         Whitened measurements.
     loaded : ndarray, shape (n_l,), int64
@@ -68,6 +70,7 @@ class Observed:
 
     load_case: FieldLoadCase
     operator: sp.csr_matrix
+    information: sp.csr_matrix
     data: FloatArray
     loaded: IntArray
     unknown: IntArray
@@ -100,7 +103,9 @@ class Observed:
             load_case = finer.load_case(load_case)
             loaded = np.flatnonzero(load_case.loaded.ravel()).astype(np.int64)
             basis = sp.kron(finer.parents, sp.identity(d), format="csr")[loaded][:, unknown]
-        return cls(load_case, operator, data, loaded, unknown, basis, _surface_prior(mesh, unknown), noise, exact)
+        return cls(
+            load_case, operator, (operator.T @ operator).tocsr(), data, loaded, unknown, basis, _surface_prior(mesh, unknown), noise, exact
+        )
 
     def sought(self, u: FloatArray) -> FloatArray:
         """Return the sought displacements (n_b,), mm, among the displacement (n, d) of all nodes."""

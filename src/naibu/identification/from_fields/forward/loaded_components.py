@@ -18,9 +18,11 @@ if TYPE_CHECKING:
     from naibu.identification.from_fields.forward.sensitivities import Linearised
 
 BLOCK = 256  # right-hand sides solved together
-BOUNDARY_TOLERANCE = 1e-5
+BOUNDARY_TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-3  # relative residuals; the latter within a search: Hessians err by its square
 EXACT_TRACE, PROBES = 1200, 64  # components up to which a trace is computed as it is; random vectors that estimate it beyond
 BOUNDARY_ITERATIONS = 200
+REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
+AT_ONCE = 4  # iterations from which so many columns cost more with the Hessian of an earlier point than one made anew
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -53,7 +55,7 @@ class BoundaryPreconditioner:
             force[o.loaded] = 0.0
             moved = -factor.solve(force)
             moved[o.loaded] = o.basis[:, start:stop].toarray()
-            pull = np.asarray(o.operator.T @ (o.operator @ moved))
+            pull = np.asarray(o.information @ moved)
             inner = pull.copy()
             inner[o.loaded] = 0.0
             answer = factor.solve(inner)
@@ -99,22 +101,74 @@ def alike(one: Observed, other: Observed) -> bool:
     return bool(np.allclose(one.operator.data * one.noise_mm, other.operator.data * other.noise_mm, rtol=1e-6, atol=0.0))
 
 
+@dataclass(slots=True, eq=False)
+class KeptPreconditioners:
+    """Preconditioners of all load cases, kept from one point of the search to the next while that costs less than to make them anew.
+
+    Attributes
+    ----------
+    made : list of BoundaryPreconditioner or None
+        Those there are.
+    informed : list of float or None
+        Number of loaded components that the measurements determine, from the last one made; None before a first one.
+    spent : int
+        Columns times iterations that were solved with them at other points than that at which they were made.
+    """
+
+    made: list[BoundaryPreconditioner | None]
+    informed: list[float | None]
+    spent: int = 0
+
+    @classmethod
+    def none(cls, load_cases: int) -> KeptPreconditioners:
+        """Return the state before a first one."""
+        return cls([None] * load_cases, [None] * load_cases)
+
+    def forget(self) -> None:
+        """Have all made anew on their next use."""
+        self.made[:], self.spent = [None] * len(self.made), 0
+
+    def take(self, other: KeptPreconditioners) -> None:
+        """Take those of a model of the same load cases under another law."""
+        self.made[:], self.informed[:], self.spent = other.made, other.informed, other.spent
+
+    def keep(self, t: int, found: BoundaryPreconditioner) -> None:
+        """Keep the one of load case `t`."""
+        self.made[t], self.informed[t] = found, found.informed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solved:
+    """Solutions and residuals (n_b, r) of every load case, and after how many iterations."""
+
+    solution: list[FloatArray]
+    residual: list[FloatArray]
+    iterations: int
+
+
 def conjugate_gradients(
     product: Callable[[list[FloatArray]], list[FloatArray]],
     precondition: Callable[[list[FloatArray]], list[FloatArray]],
     right: list[FloatArray],
-) -> tuple[list[FloatArray], int]:
-    """Solve independent systems of several load cases, every column by its own iteration, all advanced together; also after how many."""
+    tolerance: float = BOUNDARY_TOLERANCE,
+) -> Solved:
+    """Solve independent systems of several load cases, every column by its own iteration, all advanced together.
+
+    Raises
+    ------
+    ConvergenceError
+        A residual does not fall to the fraction `tolerance` within `BOUNDARY_ITERATIONS`.
+    """
 
     def dot(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
         return [np.einsum("ij,ij->j", p, q) for p, q in zip(a, b, strict=True)]
 
     x, r = [np.zeros_like(b) for b in right], [b.copy() for b in right]
-    target = [BOUNDARY_TOLERANCE * np.linalg.norm(b, axis=0) for b in right]
+    target = [tolerance * np.linalg.norm(b, axis=0) for b in right]
     p, rz = [np.zeros_like(b) for b in right], [np.ones(b.shape[1]) for b in right]
     for iteration in range(BOUNDARY_ITERATIONS):
         if all((np.linalg.norm(a, axis=0) <= limit).all() for a, limit in zip(r, target, strict=True)):
-            return x, iteration
+            return Solved(x, r, iteration)
         z = precondition(r)
         new = dot(r, z)
         for t in range(len(p)):

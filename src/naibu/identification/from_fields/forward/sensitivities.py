@@ -23,14 +23,20 @@ from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import FieldElements, FieldLaw, LawName, computed_mesh, field_law
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, loaded_from_rest
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones, is_surface_sought
-from naibu.identification.from_fields.forward.loaded_components import BLOCK, BoundaryPreconditioner, alike, conjugate_gradients
+from naibu.identification.from_fields.forward.loaded_components import (
+    AT_ONCE,
+    BLOCK,
+    BOUNDARY_TOLERANCE,
+    REFRESHED,
+    BoundaryPreconditioner,
+    KeptPreconditioners,
+    Solved,
+    alike,
+    conjugate_gradients,
+)
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
-REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
-OUTDATED = (
-    60  # iterations of conjugate gradients from which the Hessian of loaded components is made anew: that costs as much as a few solutions
-)
 Gradient = tuple[FloatArray, list[FloatArray]]  # with respect to theta, and to the sought displacements of every load case
 
 
@@ -92,8 +98,7 @@ class FieldModel:
         self.law: FieldLaw = field_law(self.computed, law, averaged=self.averaged)
         self.observed = tuple(Observed.of(mesh, self.computed, load_case) for load_case in load_cases)
         self.solvers = Solvers(self.law, self.computed.points)
-        self.boundary: list[BoundaryPreconditioner | None] = [None] * len(self.observed)
-        self.informed: list[float | None] = [None] * len(self.observed)
+        self.boundary = KeptPreconditioners.none(len(self.observed))
 
     @property
     def points(self) -> FloatArray:
@@ -129,7 +134,7 @@ class FieldModel:
         out.__dict__.update(self.__dict__)
         out.law = field_law(self.computed, law, averaged=self.averaged)
         out.solvers = Solvers(out.law, self.points)
-        out.boundary, out.informed = [None] * len(self.observed), [None] * len(self.observed)
+        out.boundary = KeptPreconditioners.none(len(self.observed))
         return out
 
     @property
@@ -138,7 +143,7 @@ class FieldModel:
 
         Before a first point was found, as if all loaded components were determined.
         """
-        return self.n_data - sum(len(o.unknown) if i is None else i for o, i in zip(self.observed, self.informed, strict=True))
+        return self.n_data - sum(len(o.unknown) if i is None else i for o, i in zip(self.observed, self.boundary.informed, strict=True))
 
     def evaluate(self, theta: FloatArray, guesses: Sequence[FloatArray]) -> Point:
         """Find the equilibrium of all load cases; `guesses` (n, d), mm, hold the displacement of the loaded components, and help elsewhere.
@@ -184,7 +189,7 @@ class FieldModel:
         lame, shear = moduli_of(self.zones, point.theta)
         for t, o in enumerate(self.observed):
             if len(o.unknown) <= REFRESHED:
-                self.boundary[t] = None
+                self.boundary.made[t] = None
         columns = [modulus_columns(self.law, self.zones, lame, shear, u) for u in point.states]
         stiffness: list[sp.bsr_matrix] = []
         for u in point.states:
@@ -226,6 +231,7 @@ class Linearised:
     _transposed: list[sp.csr_matrix] = field(default_factory=list)
     _border: list[sp.csr_matrix] = field(default_factory=list)
     _gradient: Gradient | None = None
+    _fresh: bool = False
 
     def __post_init__(self) -> None:
         self._transposed = [c.T for c in self.columns]
@@ -299,7 +305,7 @@ class Linearised:
     def product(self, theta: FloatArray, loaded: Sequence[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
         """Return the Gauss-Newton Hessian of half the misfit and prior times a vector; parts (2 count, r) and (n_b, r) as in `forward`."""
         moved = self.forward(theta, loaded)
-        out, at_loaded = self.adjoint([o.operator.T @ (o.operator @ u) for o, u in zip(self.model.observed, moved, strict=True)])
+        out, at_loaded = self.adjoint([o.information @ u for o, u in zip(self.model.observed, moved, strict=True)])
         return out, [a + o.prior @ b for a, o, b in zip(at_loaded, self.model.observed, loaded, strict=True)]
 
     def preconditioned(self, loaded: Sequence[FloatArray]) -> list[FloatArray]:
@@ -317,43 +323,56 @@ class Linearised:
 
     def boundary(self, t: int) -> BoundaryPreconditioner:
         """Return the preconditioner of the loaded components of load case `t`, made on first use and kept."""
-        made = self.model.boundary
-        found = made[t]
+        kept = self.model.boundary
+        made, found = kept.made, kept.made[t]
         if found is None:
             twin = next((s for s in range(t) if made[s] is not None and alike(self.model.observed[s], self.model.observed[t])), None)
             shared = None if twin is None else made[twin]
             found = BoundaryPreconditioner.of(self, t) if shared is None or twin is None else shared.scaled(self.model.observed, twin, t)
-            made[t], self.model.informed[t] = found, found.informed
+            kept.keep(t, found)
+            self._fresh = True
         return found
 
     def loaded_solved(self, right: Sequence[FloatArray]) -> list[FloatArray]:
         """Solve with the Hessian of the loaded components: (n_b, r) of every load case, by preconditioned conjugate gradients."""
+        return self._loaded_solved(right, BOUNDARY_TOLERANCE).solution
 
+    def _loaded_solved(self, right: Sequence[FloatArray], tolerance: float) -> Solved:
         def product(loaded: list[FloatArray]) -> list[FloatArray]:
             moved = self.forward(None, loaded)
-            pulled = [o.operator.T @ (o.operator @ u) for o, u in zip(self.model.observed, moved, strict=True)]
+            pulled = [o.information @ u for o, u in zip(self.model.observed, moved, strict=True)]
             return [a + o.prior @ b for a, o, b in zip(self.adjoint(pulled)[1], self.model.observed, loaded, strict=True)]
 
+        kept, columns = self.model.boundary, sum(b.shape[1] for b in right)
+        most = sum(len(o.unknown) for o in self.model.observed)
+        if not self._fresh and (columns * AT_ONCE > most or kept.spent > most):
+            kept.forget()
         try:
-            found, iterations = conjugate_gradients(product, self.preconditioned, list(right))
+            found = conjugate_gradients(product, self.preconditioned, list(right), tolerance)
         except ConvergenceError:  # the preconditioner is that of other moduli, too far from these
-            self.model.boundary[:] = [None] * len(self.model.boundary)
-            return conjugate_gradients(product, self.preconditioned, list(right))[0]
-        if iterations > OUTDATED:
-            self.model.boundary[:] = [None] * len(self.model.boundary)
+            kept.forget()
+            found = conjugate_gradients(product, self.preconditioned, list(right), tolerance)
+        if not self._fresh:
+            kept.spent += columns * found.iterations
         return found
 
-    def concentrated(self, basis: FloatArray) -> Concentrated:
-        """Return half the misfit as a quadratic in changes of theta along `basis` (2 count, k), minimised over the loaded components."""
+    def concentrated(self, basis: FloatArray, tolerance: float = BOUNDARY_TOLERANCE) -> Concentrated:
+        """Return half the misfit as a quadratic in changes of theta along `basis` (2 count, k), minimised over the loaded components.
+
+        Hessian and gradient err by the square of what `tolerance`, a relative residual, leaves of the loaded components.
+        """
         moved = self.forward(basis, None)
-        pulls = [o.operator.T @ (o.operator @ u) for o, u in zip(self.model.observed, moved, strict=True)]
+        pulls = [o.information @ u for o, u in zip(self.model.observed, moved, strict=True)]
         theta, loaded = self.gradient()
         cross = self.adjoint(pulls)[1]
-        solved = self.loaded_solved([np.column_stack([c, g]) for c, g in zip(cross, loaded, strict=True)])
-        response = [x[:, :-1] for x in solved]
-        hessian = sum(u.T @ p - c.T @ x for u, p, c, x in zip(moved, pulls, cross, response, strict=True))
-        gradient = basis.T @ theta - sum(x.T @ g for x, g in zip(response, loaded, strict=True))
-        return Concentrated(np.asarray(0.5 * (hessian + hessian.T)), np.asarray(gradient), response, [x[:, -1] for x in solved])
+        solved = self._loaded_solved([np.column_stack([c, g]) for c, g in zip(cross, loaded, strict=True)], tolerance)
+        response, offset = [x[:, :-1] for x in solved.solution], [x[:, -1] for x in solved.solution]
+        # with the inverse A^-1 and the residual R = C - A X of a solution X: C' A^-1 C = C' X + X' R + R' A^-1 R
+        left = [r[:, :-1] for r in solved.residual]
+        parts = zip(moved, pulls, cross, response, left, strict=True)
+        hessian = sum(u.T @ p - c.T @ x - x.T @ r for u, p, c, x, r in parts)
+        gradient = basis.T @ theta - sum(x.T @ g + r.T @ y for x, g, r, y in zip(response, loaded, left, offset, strict=True))
+        return Concentrated(np.asarray(0.5 * (hessian + hessian.T)), np.asarray(gradient), response, offset)
 
     def jacobians(self, quadratic: Concentrated) -> list[FloatArray]:
         """Return the derivatives (q, 2 count) of the whitened residuals of every load case, the loaded components following theta."""

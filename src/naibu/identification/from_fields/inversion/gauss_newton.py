@@ -18,6 +18,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
+from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point
 from naibu.identification.from_fields.inversion.regularization import Regularization
 
@@ -172,7 +173,7 @@ def first_point(model: FieldModel, theta: FloatArray) -> Point:
     moved = at.forward(None, step)
     states = [u + du.reshape(u.shape) for u, du in zip(at.point.states, moved, strict=True)]
     if small is not model:  # what preconditions small strain does so at finite strain, and took longer to make than all else here
-        model.boundary[:], model.informed[:] = small.boundary, small.informed
+        model.boundary.take(small.boundary)
     if model.law.linear:
         return model.evaluate(theta, states)
     try:
@@ -184,7 +185,7 @@ def first_point(model: FieldModel, theta: FloatArray) -> Point:
 def exact_step(at: Linearised, objective: Objective) -> Step:
     """Return the Gauss-Newton step from the explicit Hessian of all moduli, the loaded components eliminated."""
     theta = at.point.theta
-    data = at.concentrated(np.eye(len(theta)))
+    data = at.concentrated(np.eye(len(theta)), ROUGH_TOLERANCE)
     hessian = data.hessian + objective.curvature(theta).toarray()
     hessian[np.diag_indices_from(hessian)] += ANCHOR * float(np.diag(hessian).max())
     gradient = data.gradient + objective.slope(theta)

@@ -23,6 +23,7 @@ from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
+from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph, cell_volumes
@@ -299,7 +300,7 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
             break
         before, least = here, left
         slopes = mixing.moduli(here.theta, here.moves)[1]
-        quadratic = at.concentrated(slopes)
+        quadratic = at.concentrated(slopes, ROUGH_TOLERANCE)
         hessian = quadratic.hessian.copy()
         hessian[n:, n:] += np.eye(len(here.moves)) / edge**2
         pull = np.concatenate([np.zeros(n), (here.moves - mixing.borders.moves.ravel()) / edge**2])
@@ -337,7 +338,7 @@ def _stepped(model: FieldModel, mixing: Mixing, here: _Trial, bounds: Bounds) ->
     n, edge, objective = len(here.theta), mixing.borders.edge_mm, Objective(bounds=bounds)
     slopes = mixing.moduli(here.theta, here.moves)[1]
     at = model.linearised(model.evaluate(here.point.theta, here.point.states))
-    quadratic = at.concentrated(slopes)
+    quadratic = at.concentrated(slopes, ROUGH_TOLERANCE)
     hessian, gradient = quadratic.hessian.copy(), quadratic.gradient.copy()
     hessian[n:, n:] += np.eye(len(here.moves)) / edge**2
     gradient[n:] += (here.moves - mixing.borders.moves.ravel()) / edge**2
@@ -360,7 +361,7 @@ def _with_covariance(model: FieldModel, mixing: Mixing, found: _Trial) -> Refine
     """Return what was found as regions, with the covariance of the moduli."""
     theta, moves, n, edge = found.theta, found.moves, len(found.theta), mixing.borders.edge_mm
     point = model.evaluate(found.point.theta, found.point.states)
-    hessian = model.linearised(point).concentrated(mixing.moduli(theta, moves)[1]).hessian.copy()
+    hessian = model.linearised(point).concentrated(mixing.moduli(theta, moves)[1], ROUGH_TOLERANCE).hessian.copy()
     hessian[n:, n:] += np.eye(len(moves)) / edge**2
     try:
         whole, part = (np.asarray(np.linalg.inv(h)[:n, :n], dtype=float) for h in (hessian, hessian[:n, :n]))

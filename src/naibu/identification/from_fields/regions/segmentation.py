@@ -22,6 +22,7 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
+from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Point
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, first_point, search
 from naibu.identification.from_fields.inversion.regularization import BULK_WEIGHT, ZoneGraph
@@ -351,7 +352,7 @@ def _from_clusters(
     point, moved = _at(model.with_zones(joined(model.zones, labels)), theta, start), 0
     for _ in range(ROUNDS):
         fitted = model.with_zones(joined(model.zones, labels))
-        quadratic = _scaled(fitted.linearised(point).concentrated(np.eye(len(point.theta))), criterion.scale)
+        quadratic = _scaled(fitted.linearised(point).concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE), criterion.scale)
         united, theta = merged(quadratic, point.theta, areas_between(graph, labels), criterion.weight, criterion.charge)
         before, labels = int(labels.max()), united[labels]
         labels, point = _refitted(model, labels, theta, point, bounds, progress)
@@ -395,7 +396,7 @@ def _with_better_borders(
     model: FieldModel, criterion: Criterion, labels: IntArray, point: Point, bounds: Bounds, progress: Progress | None
 ) -> tuple[IntArray, Point, int]:
     everywhere = _at(model, point.theta.reshape(2, -1)[:, labels].ravel(), point)
-    quadratic = _scaled(model.linearised(everywhere).concentrated(np.eye(2 * criterion.graph.count)), criterion.scale)
+    quadratic = _scaled(model.linearised(everywhere).concentrated(np.eye(2 * criterion.graph.count), ROUGH_TOLERANCE), criterion.scale)
     found, moves = border_moves(criterion.graph, labels, point.theta, quadratic, criterion.weight)
     if not moves:
         return labels, point, 0
