@@ -9,7 +9,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact.cut_lips import CutLips, cut_lips
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_strain.penalties import node_shear_moduli
+from naibu.mechanics.finite_strain.penalties import node_bulk_moduli, node_shear_moduli
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +81,13 @@ def with_secant(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
     return replace(moved, secant=True) if isinstance(moved, LipAssembler) else moved
 
 
+def with_unyielding_lips(assembler: Assembler) -> Assembler:
+    """Return the assembler whose sides of cuts have their largest penalties; the same where there is no cut."""
+    if not isinstance(assembler, LipAssembler) or assembler.lips is None:
+        return assembler
+    return replace(assembler, lips=assembler.lips.unyielding())
+
+
 def with_friction(assembler: Assembler, coefficient: float) -> Assembler:
     """Return an assembler whose sides of cuts rub on each other; the same where there is no cut.
 
@@ -121,7 +128,9 @@ def with_lips(
     InputError
         A negative coefficient.
     """
-    lips = cut_lips(points, faces, node_shear_moduli(assembler), cells, outward) if faces.shape[1] == 3 else None
+    if faces.shape[1] != 3:
+        return assembler
+    lips = cut_lips(points, faces, (node_shear_moduli(assembler), node_bulk_moduli(assembler)), cells, outward)
     if lips is None:
         return assembler
     lips = lips.with_friction(friction)

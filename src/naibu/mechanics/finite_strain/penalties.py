@@ -15,7 +15,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.mechanics.contact.penalty_contact import STICK, Contact
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_elements.hyperelasticity import small_strain_shear_moduli
+from naibu.mechanics.finite_elements.hyperelasticity import small_strain_bulk_moduli, small_strain_shear_moduli
 from naibu.mechanics.finite_strain.nearby_contact import local_positions
 from naibu.mechanics.finite_strain.problem import Problem
 
@@ -49,7 +49,16 @@ def with_softer_sticking(problem: Problem) -> Problem | None:
 
 def node_shear_moduli(assembler: Assembler) -> FloatArray:
     """Return the smallest shear modulus (n,), kPa, of the elements at every node."""
-    cells = small_strain_shear_moduli(assembler.law_codes, assembler.parameters)
+    return _least(assembler, small_strain_shear_moduli(assembler.law_codes, assembler.parameters))
+
+
+def node_bulk_moduli(assembler: Assembler) -> FloatArray:
+    """Return the smallest bulk modulus (n,), kPa, of the elements at every node."""
+    return _least(assembler, small_strain_bulk_moduli(assembler.law_codes, assembler.parameters))
+
+
+def _least(assembler: Assembler, cells: FloatArray) -> FloatArray:
+    """Return the smallest value (n,) of the groups at every node, of values (m,) of the cells."""
     of_group = cells[assembler.elements.cell_of_point[:, 0]]
     out = np.full(assembler.elements.n_points, np.inf)
     np.minimum.at(out, assembler.elements.connectivity, of_group[:, None])

@@ -11,7 +11,7 @@ from naibu.core.arrays import FloatArray, require_finite
 from naibu.core.errors import ConvergenceError
 from naibu.core.status import Status
 from naibu.mechanics.finite_strain.failure_reasons import failure_reason
-from naibu.mechanics.finite_strain.lip_assembly import going_on, lips_of
+from naibu.mechanics.finite_strain.lip_assembly import going_on, lips_of, with_unyielding_lips
 from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.penalties import (
     relative_penetrations,
@@ -30,6 +30,9 @@ JUMP = 4.0  # times the displacement that was to be expected
 PSEUDO_FAILURES = 4  # of pseudo-transient continuation, each much longer than Newton's method, before no equilibrium is sought further
 AHEAD = 0.3  # of the load: a path near a known one, with limited iterations, may not spend those of more than this before it is there
 PATIENCE = 2  # load steps for which Newton's method fails, before frictional points on soft elements stick more softly
+TURNS = 8  # equilibria whose normals of sides of cuts are those of the one before
+CALMING = 0.5  # of what is out of balance after a turn, that the next may leave
+SETTLED = 1e-4  # out-of-balance force, of all forces, that the last turn of these normals may leave
 WarmStart = tuple[float, FloatArray]  # a fraction of the load, and an initial guess of the displacement there (n, 3), mm
 
 
@@ -146,7 +149,8 @@ def solve(
     """
     chosen = settings or SolverSettings()
     require_finite("problem.external_force", problem.external_force)
-    newton = Newton(with_suited_penalties(problem), chosen, solver)
+    stiff = problem.with_changes(assembler=with_unyielding_lips(problem.assembler)) if lips_of(problem.assembler) else problem
+    newton = Newton(with_suited_penalties(stiff), chosen, solver)
     rest = LoadState(0.0, np.zeros_like(problem.points), tuple(c.anchors_at_rest() for c in problem.contacts))
     first = rest if start is None else LoadState(0.0, start.displacement, start.anchors, lips=start.lips)
     newton.problem = _from_state(newton.problem, first)
@@ -228,6 +232,8 @@ class _LoadPath:
             found = newton.solve(guess, last.anchors, load)
             if found is not None:
                 break
+        if found is None and lips_of(newton.problem.assembler):
+            found = with_kept_normals(newton, guesses[0], last, load)
         if found is None and load - last.load < PSEUDO_TRANSIENT_STEP * newton.settings.first_step:
             found = newton.pseudo_transient(last.displacement, last.anchors, load)
             if found is None:
@@ -236,6 +242,30 @@ class _LoadPath:
                 self.smooth_from = len(self.states)
                 return found, int(USUAL_ITERATIONS)
         return found, newton.iterations - before
+
+
+def with_kept_normals(newton: Newton, guess: FloatArray, last: LoadState, load: float) -> tuple[FloatArray, float] | None:
+    """Return equilibrium, and its residual, of a body whose sides of cuts keep their normals while it is sought; None where there is none.
+
+    The tangent of sides in contact leaves out that their normals turn. Where they press with more than the shear modulus, as in nearly
+    incompressible bodies between walls, Newton's method with it does not converge. Here the normals are those of the last state, then those
+    of the equilibrium found with them, until it does not change.
+    """
+    turning, found, least = newton.problem, None, np.inf
+    for _ in range(TURNS):
+        before = last.displacement if found is None else found[0]
+        newton.problem = turning.with_changes(assembler=turning.assembler.in_step(before, last.lips))
+        found = newton.solve(guess if found is None else found[0], last.anchors, load)
+        newton.problem = turning
+        if found is None:
+            return None
+        left = newton.unbalanced(found[0], last.anchors, load)
+        if left <= max(SETTLED, newton.settings.tolerance_at(load)):
+            return found[0], left
+        if left > CALMING * least:
+            return None
+        least = left
+    return None
 
 
 def _from_state(problem: Problem, state: LoadState) -> Problem:

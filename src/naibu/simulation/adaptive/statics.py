@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -31,7 +31,7 @@ from naibu.meshing.surface import boundary_faces
 from naibu.simulation.adaptive.conditions import Conditions, Selection
 from naibu.simulation.adaptive.error_estimator import recovery_indicators
 from naibu.simulation.adaptive.force_error import first_piola, path_force_errors
-from naibu.simulation.cut_sides import caution_of_cuts, with_sides_of_cuts
+from naibu.simulation.cut_sides import with_sides_of_cuts
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,8 +55,6 @@ class StaticResult:
         `force_errors`, without cells whose errors cancel.
     carried : ndarray, shape (n, k), optional
         Values of the nodes that the next solution begins from, on its mesh, instead of the displacement.
-    caution : str
-        By how much the force of a body that is cut may be too low where it cannot give way sideways; empty where that is not worth saying.
     """
 
     displacement: FloatArray
@@ -66,7 +64,6 @@ class StaticResult:
     force_errors: dict[str, FloatArray] = field(default_factory=dict)
     force_error: float | None = None
     carried: FloatArray | None = None
-    caution: str = ""
 
     def corrected_force(self, name: str) -> FloatArray:
         """Return the force (3,), mN, of an indenter on the body less its estimated error."""
@@ -332,12 +329,11 @@ def static_result(mesh: Mesh, found: Solution, materials: Sequence[Material], go
     """Return the last state of a solution with the errors of the cells; see `hyperelastic_static`."""
     u = found.displacement
     energy = found.problem.assembler.forces(u)[0]
-    caution = caution_of_cuts(found.problem.assembler, "a force")
     if goal == "force":
-        return replace(_with_force_errors(mesh, found, energy), caution=caution)
+        return _with_force_errors(mesh, found, energy)
     stress = first_piola(mesh, found.problem, u, simplices(mesh).displacement_gradients(u))
     shear = np.array([m.small_strain_shear_modulus for m in materials])[mesh.regions]
-    return StaticResult(u, recovery_indicators(mesh, stress, shear), energy, found.reactions, caution=caution)
+    return StaticResult(u, recovery_indicators(mesh, stress, shear), energy, found.reactions)
 
 
 def _with_force_errors(mesh: Mesh, found: Solution, energy: float) -> StaticResult:
