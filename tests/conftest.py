@@ -1,16 +1,29 @@
 from __future__ import annotations
 
+import os
 import pickle
 import shutil
 from pathlib import Path
 
 import pytest
+from threadpoolctl import threadpool_limits
 from virtual_press import COARSE, KNOWN, Press, virtual_press, write_press
 
 from naibu._numba.process_lock import ProcessLock
 from naibu.workflows.markers import identify
 
 LONGEST_WAIT_S = 900.0
+THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+def pytest_configure() -> None:
+    """Let linear algebra have one thread in each worker, and in what tests start, unless the user wants it otherwise.
+
+    Workers fill the cores: threads of small matrices would wait for one another by computing. Kernels have their threads all the same.
+    """
+    if not any(variable in os.environ for variable in THREADS):
+        os.environ.update(dict.fromkeys(THREADS, "1"))
+        threadpool_limits(1, user_api="blas")  # what is loaded already
 
 
 @pytest.fixture(scope="session")

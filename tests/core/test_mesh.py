@@ -37,3 +37,9 @@ def test_moved_adds_the_displacement_and_keeps_the_rest() -> None:
     assert moved.cells is mesh.cells and moved.region_names == ("soft", "hard")
     with pytest.raises(InputError, match="displacement"):
         mesh.moved(np.zeros((4, 3)))
+
+
+def test_arrays_are_in_row_major_order_however_a_mesh_is_made() -> None:
+    """Numpy gives other columns of an array in column-major order, for which kernels would be compiled once more."""
+    mesh = Mesh(POINTS, CELLS[:, [1, 2, 0]], "triangle", np.zeros(2, dtype=np.int64), ("body",))
+    assert mesh.cells.flags.c_contiguous and mesh.cells.tolist() == [[1, 2, 0], [3, 2, 1]]

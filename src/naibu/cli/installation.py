@@ -11,7 +11,7 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -93,10 +93,17 @@ def doctor_rows() -> list[DoctorRow]:
     list of DoctorRow
         What naibu needs first, then what is optional.
     """
-    rows = [_python_row(), DoctorRow("naibu", "ok", __version__, "this package")]
-    rows += [_required_row(name, purpose) for name, purpose in _REQUIRED.items()]
-    rows += [_threading_row(), _kernels_row(), _cache_row(), _data_row(), _solver_row()]
-    return [*rows, *(_optional_row(name, purpose) for name, purpose in _OPTIONAL.items()), _gpu_row()]
+    return list(examined())
+
+
+def examined() -> Iterator[DoctorRow]:
+    """Give the lines of `doctor_rows`, each as soon as it is examined: those of optional packages, which take longest, last."""
+    yield _python_row()
+    yield DoctorRow("naibu", "ok", __version__, "this package")
+    yield from (_required_row(name, purpose) for name, purpose in _REQUIRED.items())
+    yield from (examine() for examine in (_threading_row, _kernels_row, _cache_row, _data_row, _solver_row))
+    yield from (_optional_row(name, purpose) for name, purpose in _OPTIONAL.items())
+    yield _gpu_row()
 
 
 def healthy(rows: Iterable[DoctorRow]) -> bool:

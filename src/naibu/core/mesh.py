@@ -40,6 +40,11 @@ class Mesh:
     regions: IntArray
     region_names: tuple[str, ...]
 
+    def __post_init__(self) -> None:
+        """Keep arrays in row-major order: for another order, kernels are compiled once more."""
+        for name in ("points", "cells"):
+            object.__setattr__(self, name, np.ascontiguousarray(getattr(self, name)))
+
     @classmethod
     def from_arrays(
         cls,

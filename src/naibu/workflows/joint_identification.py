@@ -33,7 +33,7 @@ from naibu.workflows.joint_model import JointModel, joint_model, told_by_fields,
 from naibu.workflows.markers.experiments import Source, load_experiments, parse_known
 from naibu.workflows.markers.identify import Identification, identify, require_states
 from naibu.workflows.results.files_together import written_together
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.results.result_folder import MODEL_FILE, write_joint_model
 
 FILES = (MODEL_FILE, "joint.json", "report.html")
@@ -84,6 +84,7 @@ class JointIdentification(WrittenResult):
         return self.markers.verdict.ok and (judged is None or judged.ok) and not self.model.doubts
 
 
+@no_empty_folders()
 def identify_jointly(
     experiments: Sequence[Source],
     fields: Sequence[str | os.PathLike[str]],

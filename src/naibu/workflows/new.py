@@ -10,7 +10,7 @@ from naibu import datasets
 from naibu.core.errors import InputError
 from naibu.io.experiment_folder.reader import META_FILE
 from naibu.io.files.atomic import write_atomically
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.simulate import example_text
 
 Kind = Literal["experiment", "lattice", "indentation", "chip", "fingertip", "ischemia"]
@@ -18,6 +18,7 @@ EXAMPLE = "ct_cube_plate"  # the bundled measurement whose tables the folder sta
 TABLES = {"initial.csv": "initial.csv", "pressed.csv": "height_45.csv"}
 
 
+@no_empty_folders()
 def new(kind: Kind, out: str | os.PathLike[str], *, overwrite: bool = False) -> tuple[Path, ...]:
     """Write what a user starts from: every key with a comment, and data with which it runs as it is.
 

@@ -16,7 +16,7 @@ from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.result_page.page import report_html
 from naibu.workflows.markers.experiments import Source, load_experiment, loaded_names, require_loaded
 from naibu.workflows.results.files_together import written_together
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.results.report_content import prediction_report, prediction_scene
 from naibu.workflows.results.result_folder import PREDICTION_FILES, read_model, write_prediction
 
@@ -56,6 +56,7 @@ class PredictionRun(Prediction, ShownInNotebook):
         )
 
 
+@no_empty_folders()
 def predict(
     model: CalibratedModel | str | os.PathLike[str],
     experiment: Source,

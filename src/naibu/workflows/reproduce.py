@@ -25,7 +25,7 @@ from naibu.viewer.tables import scrollable, table_html
 from naibu.workflows.parallel.run_tasks import run_tasks
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 MEMORY_MB = 1500.0  # of the largest chapter
 
@@ -54,6 +54,7 @@ class ReproducedChapter:
     seconds: float
 
 
+@no_empty_folders()
 def reproduce(chapter: str, *, out: str | os.PathLike[str], seed: int = 0, overwrite: bool = False) -> tuple[Chapter, Path, Path]:
     """Recompute the tables and figures of a chapter; write ``CHAPTER.html`` and ``CHAPTER.json``.
 
@@ -103,6 +104,7 @@ def processor_seconds(chapters: tuple[str, ...]) -> float:
     return sum(PROCESSOR_S[name] for name in chapters)
 
 
+@no_empty_folders()
 def reproduce_all(
     out: str | os.PathLike[str],
     *,

@@ -43,6 +43,7 @@ from naibu.workflows.fields.object_on_cubes import ObjectOnCubes, ScannedObject,
 SIDE_MM, CELLS, SD_MM = 40.0, 20, 0.02
 TRUTH = {"pad": (10.0, 0.45), "core": (8.0, 0.45), "skin": (3.0, 0.45)}
 NAMES = {1: "pad", 2: "core", 3: "skin"}
+STATED, BOUNDS = parse_known_zones(["pad=10 kPa, 0.45"], list(NAMES.values())), Bounds(shear_modulus=(1e-3, 1e5))
 
 
 @cache
@@ -210,19 +211,25 @@ def scanned_limb() -> ScannedObject:
     return ScannedObject(inside, numbers, NAMES, (("push", DisplacementField.from_arrays(points, moved, sd_mm=SD_MM)),), ())
 
 
-def identified_again(cubes: ObjectOnCubes, most: int) -> tuple[FieldEstimate, ObjectOnCubes, FieldEstimate, list[str]]:
-    """Return moduli on cubes and what at most so many smaller ones make of them, with what was reported on the way."""
-    stated, bounds, told = parse_known_zones(["pad=10 kPa, 0.45"], list(NAMES.values())), Bounds(shear_modulus=(1e-3, 1e5)), list[str]()
-    found = cubes.identified(stated, law="neo_hookean", bounds=bounds, each_cell=False, progress=None)
+@cache
+def identified_in_cubes() -> tuple[ObjectOnCubes, FieldEstimate]:
+    """Return the limb in cubes of 8 mm, wider than its skin, and its moduli."""
+    cubes = scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False)
+    return cubes, cubes.identified(STATED, law="neo_hookean", bounds=BOUNDS, each_cell=False, progress=None)
+
+
+def identified_again(most: int) -> tuple[ObjectOnCubes, FieldEstimate, list[str]]:
+    """Return what at most so many smaller cubes make of the moduli, with what was reported on the way."""
+    (cubes, found), told = identified_in_cubes(), list[str]()
     smaller, again = identified_on_smaller_cubes(
-        cubes, found, stated, most=most, law="neo_hookean", bounds=bounds, progress=lambda report: told.append(report.stage)
+        cubes, found, STATED, most=most, law="neo_hookean", bounds=BOUNDS, progress=lambda report: told.append(report.stage)
     )
-    return found, smaller, again, told
+    return smaller, again, told
 
 
 def test_moduli_that_cubes_limit_are_identified_again_on_smaller_ones() -> None:
     """Of 8 mm, wider than the skin; then of 5 mm. The intervals hold the truth and what the larger ones gave, and are narrower."""
-    found, smaller, again, told = identified_again(scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False), 520)
+    (_, found), (smaller, again, told) = identified_in_cubes(), identified_again(520)
     assert found.limited_by_mesh and 400 < smaller.mesh.n_cells < 700
     assert any(line.startswith("the size of cubes limits what is known of moduli: again with cubes of 5 mm") for line in told)
     within, before = again.intervals()[0], found.intervals()[0]
@@ -232,8 +239,7 @@ def test_moduli_that_cubes_limit_are_identified_again_on_smaller_ones() -> None:
 
 
 def test_cubes_stay_where_they_limit_nothing_or_can_hardly_be_smaller() -> None:
-    cubes = scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False)
-    found, smaller, again, told = identified_again(cubes, 150)  # of 125
+    (cubes, found), (smaller, again, told) = identified_in_cubes(), identified_again(150)  # of 125
     assert smaller is cubes and again is found and told == []
     assert smaller_size(SIDE_MM**3, cubes.mesh, 10**6) == pytest.approx(4.0)  # half as large at once
     assert smaller_size(SIDE_MM**3, cubes.mesh, 8 * 27) == pytest.approx(SIDE_MM / 6.0)
@@ -242,8 +248,7 @@ def test_cubes_stay_where_they_limit_nothing_or_can_hardly_be_smaller() -> None:
 
 def test_cubes_stay_where_a_thin_zone_stays_one_cube_thick() -> None:
     """The skin, of 2 to 6 mm, is one cube of 6.7 mm thick as it is one of 8 mm, but not of 5 mm (above)."""
-    cubes = scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False)
-    found, same, kept, told = identified_again(cubes, 210)
+    (cubes, found), (same, kept, told) = identified_in_cubes(), identified_again(210)
     assert found.limited_by_mesh and "skin" in one_cell_thick(cubes.mesh)
     assert same is cubes and kept is found
     (told_so,) = told
@@ -254,11 +259,10 @@ def test_larger_cubes_stand_where_smaller_ones_find_no_equilibrium(monkeypatch: 
     def without_equilibrium(*_: object, **__: object) -> FieldEstimate:
         raise ConvergenceError("a cell is inverted")
 
-    cubes, told = scanned_limb().on_cubes(8.0, ("core", "skin"), exactly=True, each_cell=False), list[str]()
+    cubes, told = identified_in_cubes()[0], list[str]()
     monkeypatch.setattr(ObjectOnCubes, "identified", without_equilibrium)
     found = Mock(spec=FieldEstimate, limited_by_mesh=True, zones=Mock(names=("core", "skin")))
-    stated, bounds = parse_known_zones(["pad=10 kPa, 0.45"], list(NAMES.values())), Bounds()
     same, kept = identified_on_smaller_cubes(
-        cubes, found, stated, most=520, law="neo_hookean", bounds=bounds, progress=lambda report: told.append(report.stage)
+        cubes, found, STATED, most=520, law="neo_hookean", bounds=BOUNDS, progress=lambda report: told.append(report.stage)
     )
     assert same is cubes and kept is found and told[-1].endswith("on the larger ones: a cell is inverted")

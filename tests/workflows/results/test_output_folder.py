@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
 import os
+import pkgutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+import naibu.workflows
 from naibu.core.errors import InputError
 from naibu.io.files.atomic import new_aside, writer_of
-from naibu.workflows.results.output_folder import folder_of_results, output_folder
+from naibu.workflows.measurement.multiscale_results import folder_for_multiscale
+from naibu.workflows.reproduce import missing_chapters
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 
 def test_a_folder_is_made_and_may_hold_other_files(tmp_path: Path) -> None:
@@ -71,12 +78,16 @@ def test_long_names_have_temporary_files_too(tmp_path: Path) -> None:
 
 
 def test_a_folder_in_which_a_run_that_failed_wrote_nothing_is_taken_away_again(tmp_path: Path) -> None:
+    @no_empty_folders()
+    def run(place: Path, name: str = "") -> None:
+        folder = output_folder(place, ["report.html"])
+        if name:
+            (folder / name).write_text("")
+        raise InputError("useless")
+
     def fail(place: Path, name: str = "") -> None:
-        with pytest.raises(InputError, match="useless"), folder_of_results(place, ["report.html"]) as folder:
-            assert folder.is_dir()
-            if name:
-                (folder / name).write_text("")
-            raise InputError("useless")
+        with pytest.raises(InputError, match="useless"):
+            run(place, name)
 
     fail(tmp_path / "a" / "b")
     assert not (tmp_path / "a").exists()
@@ -86,6 +97,36 @@ def test_a_folder_in_which_a_run_that_failed_wrote_nothing_is_taken_away_again(t
     fail(tmp_path / "mine")  # as is a folder that was there before
     assert (tmp_path / "mine").is_dir()
     (tmp_path / "c" / "d" / "report.html").write_text("")
-    with pytest.raises(InputError, match="already holds"), folder_of_results(tmp_path / "c" / "d", ["report.html"]):
-        pass
+    with pytest.raises(InputError, match="already holds"):
+        run(tmp_path / "c" / "d")
     assert (tmp_path / "c" / "d" / "report.html").is_file()
+
+
+def test_a_run_within_another_that_fails_later_leaves_no_folder_either(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="useless"), no_empty_folders():
+        with no_empty_folders():
+            output_folder(tmp_path / "a" / "b")
+        assert (tmp_path / "a" / "b").is_dir()
+        raise InputError("useless")
+    assert not os.listdir(tmp_path)
+
+
+ASIDE = (folder_for_multiscale, missing_chapters)  # the one makes a folder for its caller, the other only looks into one
+
+
+def writers() -> Iterator[Callable[..., object]]:
+    """Give the public functions of the workflows that write results to a folder `out`."""
+    for found in pkgutil.walk_packages(naibu.workflows.__path__, "naibu.workflows."):
+        module = importlib.import_module(found.name)
+        if hasattr(module, "output_folder") and module is not sys.modules[output_folder.__module__]:
+            for name, value in vars(module).items():
+                if inspect.isfunction(value) and value.__module__ == found.name and not name.startswith("_"):
+                    signature = inspect.signature(value)
+                    if "out" in signature.parameters and value not in ASIDE:
+                        yield value
+
+
+def test_no_function_that_writes_results_leaves_an_empty_folder_where_it_fails() -> None:
+    wrapped = {function: hasattr(function, "__wrapped__") for function in writers()}
+    assert len(wrapped) > 25
+    assert [f.__qualname__ for f, as_it_should in wrapped.items() if not as_it_should] == []

@@ -25,7 +25,7 @@ from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.applications.slip_report import drawn_rows, slip_card, slip_section, slip_summary, slip_words
 from naibu.workflows.applications.stored_decoder import stored_detector
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 MOST_VOLTS = 100.0  # several times what amplifiers give
 FAR_BEYOND = 10.0  # times the largest reading of the training, from which a table is in another unit, or another fingertip's
@@ -59,6 +59,7 @@ class DecodedRecord(WrittenResult):
         return self._rows_of("forces.csv")
 
 
+@no_empty_folders()
 def decode_forces(
     decoder: str | os.PathLike[str],
     readings: str | os.PathLike[str],

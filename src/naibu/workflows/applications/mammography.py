@@ -45,7 +45,7 @@ from naibu.workflows.applications.mammogram_inputs import (
 )
 from naibu.workflows.applications.mammography_figures import draw_breast, draw_views
 from naibu.workflows.applications.mammography_motion import breast_page
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 NOTICE = "Research software, not a medical device: not for diagnosis, biopsy or treatment."
 _SWAPPED = (
@@ -80,6 +80,7 @@ class MammographyRun(WrittenResult):
         return tuple({"quantity": name, "value": value} for name, value in self.rows)
 
 
+@no_empty_folders()
 def relate_views(
     cc: str | os.PathLike[str] | None = None,
     mlo: str | os.PathLike[str] | None = None,

@@ -41,7 +41,7 @@ from naibu.viewer.cards import Card
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 CHIP = "chip"  # name of the study that naibu brings along
 CHIP_TITLE = "silicon chip that senses a force and two moments"
@@ -187,6 +187,7 @@ def _study(design: ChipDesign, table: StudyTable) -> DesignStudy:
     return study_designs(design, *(_MM * np.geomspace(low, high, table.steps) for low, high in spans))
 
 
+@no_empty_folders()
 def simulate_chip(
     source: str | os.PathLike[str], out: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None
 ) -> tuple[Path, ...]:

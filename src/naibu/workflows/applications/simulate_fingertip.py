@@ -30,7 +30,7 @@ from naibu.viewer.tables import Cell
 from naibu.workflows.applications.fingertip_checkpoint import FingertipCheckpoint
 from naibu.workflows.applications.fingertip_page import FingertipResults, fingertip_cards, fingertip_sections
 from naibu.workflows.applications.fingertip_study import PreparedFingertip, in_keys, prepared_fingertip
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.simulate_lattice import SimulationRun
 
 _FREE_S = 0.5  # before and after a press in the recorded readings
@@ -44,6 +44,7 @@ class _Computed:
     done: list[Pressing]
 
 
+@no_empty_folders()
 def simulate_fingertip(
     source: str | os.PathLike[str],
     out: str | os.PathLike[str],

@@ -29,7 +29,7 @@ from naibu.viewer.cards import Card
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 ISCHEMIA = "ischemia"  # name of the study that naibu brings along
 ISCHEMIA_TITLE = "skin that turns pale under an air jet"
@@ -142,6 +142,7 @@ def prepared_ischemia(source: str | os.PathLike[str]) -> PreparedIschemia:
     )  # fmt: skip
 
 
+@no_empty_folders()
 def simulate_ischemia(
     source: str | os.PathLike[str], out: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None
 ) -> tuple[Path, ...]:

@@ -34,7 +34,7 @@ from naibu.viewer.tables import Cell, Table, table_html
 from naibu.workflows.fields.block_mesh import CELLS, block_mesh, labelled_object, names_of_labels, sizes_of_voxels
 from naibu.workflows.fields.known_zones import parse_known_zones, stated_moduli
 from naibu.workflows.fields.predict_field import parsed_sides
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 FILES = ("design.html", "design.json")
 VOXELS = 48  # along the longest side of a box
@@ -116,6 +116,7 @@ class Design:
         return Table("Expected accuracy", COLUMNS, tuple(_cells(row) for row in self.rows), note="SD: standard deviation.")
 
 
+@no_empty_folders()
 def design(
     zones: str | os.PathLike[str] | None = None,
     *,

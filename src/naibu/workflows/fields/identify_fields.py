@@ -50,7 +50,7 @@ from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_
 from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, relative_deformation
 from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ScannedObject, identified_on_smaller_cubes
 from naibu.workflows.results.files_together import written_together
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -118,6 +118,7 @@ class FieldIdentification(ShownInNotebook):
         return tuple(_as_records(table_of_zones(self)))
 
 
+@no_empty_folders()
 def identify_fields(
     fields: Sequence[str | os.PathLike[str]] | str | os.PathLike[str],
     *,

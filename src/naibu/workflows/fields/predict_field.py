@@ -30,7 +30,7 @@ from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Table
 from naibu.workflows.results.files_together import written_together
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.results.result_folder import read_identified_body
 
 if TYPE_CHECKING:
@@ -154,6 +154,7 @@ class FieldPredictionRun(ShownInNotebook):
         return tuple(dict(zip(names, row, strict=True)) for row in columns.tolist())
 
 
+@no_empty_folders()
 def predict_field(
     model: IdentifiedBody | str | os.PathLike[str],
     field: str | os.PathLike[str] | None = None,

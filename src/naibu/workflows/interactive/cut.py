@@ -37,7 +37,7 @@ from naibu.viewer.tables import Table, quantity_of
 from naibu.workflows.interactive.cut_surface import length_text, places_text
 from naibu.workflows.interactive.touchable_models import MeshMaterial, TouchableModel, touchable
 from naibu.workflows.markers.experiments import Source
-from naibu.workflows.results.output_folder import folder_of_results
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 FILES = ("cut.html", "cut.vtu", "cut-surface.vtu", "cut.vtkhdf", "cut.json")
 FRAME_S = 1.0 / 60.0
@@ -73,6 +73,7 @@ class CutRun(WrittenResult):
         return tuple({"piece": k + 1, "volume_mm3": float(v)} for k, v in enumerate(self.volumes_mm3))
 
 
+@no_empty_folders()
 def cut(
     source: str | os.PathLike[str],
     path: str | os.PathLike[str],
@@ -128,36 +129,36 @@ def cut(
         raise InputError(f"lips_friction must be a finite number that is not negative, not {lips_friction:g}; 0 is frictionless")
     require_lengths(distance_mm=distance_mm)
     blade = _blade(path)
-    with folder_of_results(out, FILES, overwrite=overwrite) as folder:
-        model = touchable(source, experiment=experiment, material=material)
-        if lips_friction > 0.0 and isinstance(model.body, LatticeBody):
-            raise InputError(f"lips_friction must be 0, not {lips_friction:g}: the sides of the cut of a lattice do not touch each other")
-        before, after, found, distance = _cut(model.body, blade, distance_mm)
-        if not len(found.faces):
-            faces = ", whose cuts follow the faces of its cubes" if isinstance(after, LatticeBody) else ""
-            raise InputError(
-                f"{path}: the blade passes beside the body, which reaches {_reach(before.points)}, or only grazes it{faces}; check the "
-                "path and its unit (mm)"
-            )
-        a, b, c = after.points[found.faces].transpose(1, 0, 2)
-        areas = 0.5 * np.cross(b - a, c - a)
-        axis = int(np.abs(areas).sum(axis=0).argmax())
-        turn = after.engine.lattice.frame.rotation if isinstance(after, LatticeBody) else np.eye(3)
-        times, moved = _pulled(_rubbing(after, lips_friction), axis, pull_percent, progress)
-        moved = moved @ turn.T
-        volumes = np.bincount(found.piece, signed_volumes(found.mesh)).astype(np.float64)
-        opening = _opening(found, moved[-1])
-        numbers = _numbers(before, found, volumes) | {
-            "area_of_the_cut_mm2": 0.5 * float(np.linalg.norm(areas, axis=1).sum()),
-            "area_of_the_blade_path_mm2": blade.area_mm2, "largest_distance_from_the_blade_mm": found.deviation_mm,
-            **({} if distance is None else {"allowed_distance_mm": 0.5 * distance}), "largest_opening_mm": opening,
-            "source": str(source), "naibu": __version__, "pull_percent": pull_percent,
-            **({"lips_friction": lips_friction} if lips_friction else {}),
-            **({"doubt": model.doubt} if model.doubt else {}), **({"caution": caution} if (caution := _caution(after)) else {}),
-            "pulled_along": "xyz"[int(np.abs(turn[:, axis]).argmax())], "inputs_sha256": {Path(path).name: sha256(path)},
-        }  # fmt: skip
-        files = _written(folder, model, after.faces, found, numbers, times, moved)
-        return CutRun(files, found, volumes, opening)
+    folder = output_folder(out, FILES, overwrite=overwrite)
+    model = touchable(source, experiment=experiment, material=material)
+    if lips_friction > 0.0 and isinstance(model.body, LatticeBody):
+        raise InputError(f"lips_friction must be 0, not {lips_friction:g}: the sides of the cut of a lattice do not touch each other")
+    before, after, found, distance = _cut(model.body, blade, distance_mm)
+    if not len(found.faces):
+        faces = ", whose cuts follow the faces of its cubes" if isinstance(after, LatticeBody) else ""
+        raise InputError(
+            f"{path}: the blade passes beside the body, which reaches {_reach(before.points)}, or only grazes it{faces}; check the "
+            "path and its unit (mm)"
+        )
+    a, b, c = after.points[found.faces].transpose(1, 0, 2)
+    areas = 0.5 * np.cross(b - a, c - a)
+    axis = int(np.abs(areas).sum(axis=0).argmax())
+    turn = after.engine.lattice.frame.rotation if isinstance(after, LatticeBody) else np.eye(3)
+    times, moved = _pulled(_rubbing(after, lips_friction), axis, pull_percent, progress)
+    moved = moved @ turn.T
+    volumes = np.bincount(found.piece, signed_volumes(found.mesh)).astype(np.float64)
+    opening = _opening(found, moved[-1])
+    numbers = _numbers(before, found, volumes) | {
+        "area_of_the_cut_mm2": 0.5 * float(np.linalg.norm(areas, axis=1).sum()),
+        "area_of_the_blade_path_mm2": blade.area_mm2, "largest_distance_from_the_blade_mm": found.deviation_mm,
+        **({} if distance is None else {"allowed_distance_mm": 0.5 * distance}), "largest_opening_mm": opening,
+        "source": str(source), "naibu": __version__, "pull_percent": pull_percent,
+        **({"lips_friction": lips_friction} if lips_friction else {}),
+        **({"doubt": model.doubt} if model.doubt else {}), **({"caution": caution} if (caution := _caution(after)) else {}),
+        "pulled_along": "xyz"[int(np.abs(turn[:, axis]).argmax())], "inputs_sha256": {Path(path).name: sha256(path)},
+    }  # fmt: skip
+    files = _written(folder, model, after.faces, found, numbers, times, moved)
+    return CutRun(files, found, volumes, opening)
 
 
 def _blade(path: str | os.PathLike[str]) -> SweptBlade:

@@ -29,7 +29,7 @@ from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.viewer.tables import Table, quantity_of
-from naibu.workflows.results.output_folder import folder_of_results
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 FILES = ("cut.html", "cut.vtu", "cut.vtkhdf", "cut.json")
 FRAMES, LARGE_FRAMES = 24, 8
@@ -72,6 +72,7 @@ def is_surface(source: str | os.PathLike[str]) -> bool:
     return Path(source).suffix.lower() in SURFACE_READERS
 
 
+@no_empty_folders()
 def cut_surface_file(
     source: str | os.PathLike[str],
     path: str | os.PathLike[str],
@@ -126,31 +127,31 @@ def cut_surface_file(
     require_within("tension_percent", tension_percent, 0.0, 100.0 * LARGEST_TENSION)
     require_lengths(distance_mm=distance_mm, groove_depth_mm=groove_depth_mm or None, reach_mm=reach_mm)
     surface, tips = read_surface(source, unit_mm=unit_mm), read_tip_path(path)
-    with folder_of_results(out, FILES, overwrite=overwrite) as folder:
-        distance = 0.5 * mean_edge_mm(surface) if distance_mm is None else distance_mm
-        try:
-            found = cut_along(surface.points, surface.triangles, tips, distance, reach_mm=reach_mm, refined=refine)
-        except InputError as error:
-            raise InputError(f"{path}: {error}" if "the tip stays" in str(error) else str(error)) from error
-        if not len(found.cut_edges):
-            raise InputError(
-                f"{path}: is too short to cut anything at a distance of {distance:.3g} mm; give a longer path or a smaller distance_mm"
-            )
-        points, walls, wall_area = _grooved(found, groove_depth_mm, distance)
-        frames = 1 if not tension_percent else FRAMES if len(found.points) <= LARGE_POINTS else LARGE_FRAMES
-        moved = np.zeros((frames + 1, len(points), 3))
-        for k, displacement in enumerate(opening(found, 0.01 * tension_percent, frames=frames)):
-            moved[k, : len(found.points)] = displacement
-            report_progress(progress, "open the cut", done=k + 1, total=frames + 1)
-        copies = np.flatnonzero(found.source != np.arange(len(found.points)))
-        gaps = np.linalg.norm(moved[-1, copies] - moved[-1, found.roots[copies]], axis=1)
-        numbers = _numbers(surface, found, distance, wall_area, float(gaps.max(initial=0.0))) | {
-            "tension_percent": tension_percent, "refined": refine, "repairs": list(found.repairs), "source": str(source),
-            "naibu": __version__,
-            "inputs_sha256": {Path(name).name: sha256(name) for name in (source, path)},
-        }  # fmt: skip
-        files = _written(folder, found, points, walls, numbers, moved)
-        return SurfaceCutRun(files, found, numbers, moved[:, : len(found.points)])
+    folder = output_folder(out, FILES, overwrite=overwrite)
+    distance = 0.5 * mean_edge_mm(surface) if distance_mm is None else distance_mm
+    try:
+        found = cut_along(surface.points, surface.triangles, tips, distance, reach_mm=reach_mm, refined=refine)
+    except InputError as error:
+        raise InputError(f"{path}: {error}" if "the tip stays" in str(error) else str(error)) from error
+    if not len(found.cut_edges):
+        raise InputError(
+            f"{path}: is too short to cut anything at a distance of {distance:.3g} mm; give a longer path or a smaller distance_mm"
+        )
+    points, walls, wall_area = _grooved(found, groove_depth_mm, distance)
+    frames = 1 if not tension_percent else FRAMES if len(found.points) <= LARGE_POINTS else LARGE_FRAMES
+    moved = np.zeros((frames + 1, len(points), 3))
+    for k, displacement in enumerate(opening(found, 0.01 * tension_percent, frames=frames)):
+        moved[k, : len(found.points)] = displacement
+        report_progress(progress, "open the cut", done=k + 1, total=frames + 1)
+    copies = np.flatnonzero(found.source != np.arange(len(found.points)))
+    gaps = np.linalg.norm(moved[-1, copies] - moved[-1, found.roots[copies]], axis=1)
+    numbers = _numbers(surface, found, distance, wall_area, float(gaps.max(initial=0.0))) | {
+        "tension_percent": tension_percent, "refined": refine, "repairs": list(found.repairs), "source": str(source),
+        "naibu": __version__,
+        "inputs_sha256": {Path(name).name: sha256(name) for name in (source, path)},
+    }  # fmt: skip
+    files = _written(folder, found, points, walls, numbers, moved)
+    return SurfaceCutRun(files, found, numbers, moved[:, : len(found.points)])
 
 
 def length_text(length_mm: float) -> str:

@@ -17,10 +17,11 @@ from naibu.workflows.markers.experiments import Source, load_experiments, parse_
 from naibu.workflows.parallel.run_tasks import run_tasks
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.results.result_folder import COMPARISON_FILE, read_comparison, write_comparison
 
 
+@no_empty_folders()
 def compare(
     experiments: Sequence[Source] | Source,
     *,

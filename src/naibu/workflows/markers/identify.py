@@ -33,7 +33,7 @@ from naibu.workflows.markers.cross_validation import left_out_in_turn
 from naibu.workflows.markers.experiments import Source, load_experiments, parse_known, provenance_of, require_element_size, require_loaded
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.files_together import written_together
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.results.report_content import build_report
 from naibu.workflows.results.result_folder import IDENTIFICATION_FILES, series_file, write_identification
 from naibu.workflows.results.search_checkpoint import CHECKPOINT_FILE, SearchCheckpoint
@@ -91,6 +91,7 @@ class Identification(ShownInNotebook):
         return build_report(self.calibration, self.model, self.verdict, self.baselines, self.left_out)
 
 
+@no_empty_folders()
 def identify(
     experiments: Sequence[Source] | Source,
     *,

@@ -20,7 +20,7 @@ from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
 from naibu.workflows.measurement.sense import FIGURES, Pair, SenseRun, sense_pair
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -39,6 +39,7 @@ class MethodComparison:
     numbers: Path
 
 
+@no_empty_folders()
 def compare_methods(
     pair: Pair,
     methods: Sequence[Method],

@@ -35,7 +35,7 @@ from naibu.viewer.slices import slices_html
 from naibu.viewer.tables import Cell
 from naibu.workflows.measurement.sense_page import middle_slice, slice_view
 from naibu.workflows.results.files_together import written_together
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -179,6 +179,7 @@ def _same(grid: Volume, other: Volume, file: Path, reference: Path) -> None:
         raise InputError(f"{file.name} does not lie on the grid of {reference.name}: {different}; resample it to that grid")
 
 
+@no_empty_folders()
 def sense(
     reference: str | os.PathLike[str],
     deformed: str | os.PathLike[str],
@@ -235,6 +236,7 @@ def sense(
     return sense_pair(pair, method=method, out=out, overwrite=overwrite, progress=progress)
 
 
+@no_empty_folders()
 def sense_pair(
     pair: Pair,
     *,

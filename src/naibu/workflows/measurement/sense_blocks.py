@@ -30,7 +30,7 @@ from naibu.workflows.measurement.block_checkpoint import BlockCheckpoint, Stored
 from naibu.workflows.measurement.multiscale_results import FILES as LEVELS
 from naibu.workflows.measurement.sense import FILES, Pair, SenseRun, common_points, recorded
 from naibu.workflows.parallel.worker_count import Workers
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 STORES = ("displacement.zarr", "standard_deviation.zarr", "mask.zarr")
 CHECKPOINT = "sense.blocks"
@@ -109,6 +109,7 @@ def stored_shape(path: str | os.PathLike[str], spacing_mm: Sequence[float] | Non
     return _stored(path, spacing_mm).opened().shape if can_be_opened(path) else None
 
 
+@no_empty_folders()
 def sense_blocks(
     reference: str | os.PathLike[str],
     deformed: str | os.PathLike[str],

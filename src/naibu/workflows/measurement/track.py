@@ -26,7 +26,7 @@ from naibu.viewer.tables import Cell, Table
 from naibu.workflows.markers.experiments import doubts_of_markers
 from naibu.workflows.markers.tilted_tables import Vertical, upright_tables
 from naibu.workflows.measurement.track_page import track_chapter, track_rows
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -111,6 +111,7 @@ class TrackRun(ShownInNotebook):
     notes: tuple[str, ...] = ()
 
 
+@no_empty_folders()
 def track(
     scans: Sequence[str | os.PathLike[str]],
     *,

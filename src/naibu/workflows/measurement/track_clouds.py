@@ -30,7 +30,7 @@ from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.notebook import ShownInNotebook, WrittenResult, empty_figure
 from naibu.viewer.result_figures import draw_marker_motion
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -81,6 +81,7 @@ def is_point_file(path: str | os.PathLike[str]) -> bool:
     return Path(path).suffix.lower() in POINT_FILES
 
 
+@no_empty_folders()
 def track_clouds(
     reference: str | os.PathLike[str],
     deformed: str | os.PathLike[str],

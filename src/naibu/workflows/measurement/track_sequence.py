@@ -23,7 +23,7 @@ from naibu.io.images import read_volume
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas
@@ -55,6 +55,7 @@ class SequenceRun:
     table: Path
 
 
+@no_empty_folders()
 def track_sequence_file(
     frames: str | os.PathLike[str],
     *,

@@ -66,23 +66,13 @@ def output_folder(
 
 
 @contextmanager
-def folder_of_results(out: str | os.PathLike[str], files: Iterable[str] = (), *, overwrite: bool = False) -> Iterator[Path]:
-    """Make a folder as `output_folder` does, for a run that may find its input useless: see `no_empty_folders`.
-
-    Raises
-    ------
-    InputError
-        See `output_folder`.
-    """
-    with no_empty_folders():
-        yield output_folder(out, files, overwrite=overwrite)
-
-
-@contextmanager
 def no_empty_folders() -> Iterator[None]:
-    """Take away the folders that `output_folder` made within this context, if an error leaves it before anything was written to them."""
+    """Take away the folders that `output_folder` made within this context, if an error leaves it before anything was written to them.
+
+    As a decorator, ``@no_empty_folders()``, it is for functions that write results: whoever calls them.
+    """
     made: list[Path] = []
-    before = _MADE.set(made)
+    outer = _MADE.set(made)
     try:
         yield
     except BaseException:
@@ -91,4 +81,6 @@ def no_empty_folders() -> Iterator[None]:
                 folder.rmdir()
         raise
     finally:
-        _MADE.reset(before)
+        _MADE.reset(outer)
+    if (around := _MADE.get()) is not None:
+        around += made  # what fails later, around this context, leaves none of them empty either

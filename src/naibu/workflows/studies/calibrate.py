@@ -29,7 +29,7 @@ from naibu.io.tables.force_records import ForceRecord, read_force_records
 from naibu.viewer.chapters.chapter_page import chapter_html
 from naibu.viewer.notebook import WrittenResult
 from naibu.workflows.parallel.worker_count import Workers
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers, start_numbers
 from naibu.workflows.studies.calibration_starts import CalibratedFromStarts, Method, calibrate_from_starts, searched
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
@@ -66,6 +66,7 @@ class LatticeCalibration(WrittenResult):
         )
 
 
+@no_empty_folders()
 def calibrate_study(
     study: str | os.PathLike[str],
     *,

@@ -11,7 +11,7 @@ from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.study_model import StudyModel
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
 from naibu.io.files.atomic import write_atomically
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.lattice_study import prepared_study, study_text
 
 SOURCE = "dough-first-pushing"
@@ -22,6 +22,7 @@ START = {"K": 50.0, "C1": 25.0, "C2": 100.0}  # the file's values, with which a 
 FILES = ("dough.toml", "shapes.csv", "forces.csv")
 
 
+@no_empty_folders()
 def write_calibration_example(out: str | os.PathLike[str], *, seed: int = 0, overwrite: bool = False) -> tuple[Path, ...]:
     """Write a study with rough values, captured points and forces of a virtual dough, with noise.
 

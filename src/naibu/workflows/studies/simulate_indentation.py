@@ -20,12 +20,13 @@ from naibu.simulation.adaptive.statics import StaticResult
 from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, force_unit, motion_html
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.indentation_study import PreparedIndentation, prepared_indentation
 
 PAGE_BYTES = 3_000_000
 
 
+@no_empty_folders()
 def simulate_indentation(
     source: str | os.PathLike[str], out: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None
 ) -> tuple[Path, ...]:

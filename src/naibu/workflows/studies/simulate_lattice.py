@@ -25,7 +25,7 @@ from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, force_
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_forces
 from naibu.viewer.tables import Table
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
 from naibu.workflows.studies.simulate_checkpoint import Checkpoint
 
@@ -119,6 +119,7 @@ class SimulationRun(ShownInNotebook):
         return np.asarray(numbers["force_times_s"], dtype=np.float64), forces
 
 
+@no_empty_folders()
 def simulate_lattice(
     source: str | os.PathLike[str],
     out: str | os.PathLike[str],

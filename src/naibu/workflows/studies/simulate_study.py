@@ -16,12 +16,13 @@ from naibu.io.files.atomic import write_atomically
 from naibu.io.vtk_files import write_vtkhdf_series
 from naibu.reproduction.chapter2.simulations import NAMES, SQUARES, Study, run
 from naibu.viewer.animation import MovingBody, animation_html
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 SLUGS = {name.replace(",", "").replace(" ", "-").lower(): name for name in NAMES}
 SQUARES_TOGETHER = "squares"
 
 
+@no_empty_folders()
 def simulate_study(name: str, out: str | os.PathLike[str], *, overwrite: bool = False, progress: Progress | None = None) -> list[Path]:
     """Run a named study; write ``STUDY.vtkhdf``, ``STUDY.json`` and, for plane studies, the animation ``STUDY.html``.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -34,6 +35,11 @@ def angle(n):
 
 def pair(mask, kind, **options):
     return classic_lattice(mask, 1.0, density=1e-6), octree_lattice(mask, 1.0, kind, density=1e-6, **options)
+
+
+@cache
+def cubes(n, kind, scaling="response"):
+    return pair(box_mask((n, n, n)), kind, scaling=scaling)
 
 
 def stiffness(lattice: Lattice, k) -> sp.csr_matrix:
@@ -114,7 +120,7 @@ def test_the_polynomials_need_no_force_inside_and_have_unit_energies(stiff):
 @pytest.mark.parametrize("load", LOADS)
 @pytest.mark.parametrize("kind", [0, 1])
 def test_a_cube_with_a_fine_surface_answers_as_the_classic_one(kind, load):
-    classic, octree = pair(box_mask((8, 8, 8)), kind)
+    classic, octree = cubes(8, kind)
     works, shapes = zip(*(answer(lattice, lattice.scale, LOADS[load]) for lattice in (classic, octree)), strict=True)
     assert works[1] == pytest.approx(works[0], rel=0.01)
     assert surface_error(octree, shapes[1], shapes[0][numbers_in(classic, octree)]) < 0.005
@@ -123,10 +129,10 @@ def test_a_cube_with_a_fine_surface_answers_as_the_classic_one(kind, load):
 @pytest.mark.parametrize("load", LOADS)
 def test_a_cube_with_coarse_corners_answers_with_the_forces_of_the_classic_one(load):
     """The corners are eight cubes of a quarter of the edge: nodes that hang there move by some strain times a voxel."""
-    classic, octree = pair(box_mask((8, 8, 8)), 2)
+    classic, octree = cubes(8, 2)
     works, shapes = zip(*(answer(lattice, lattice.scale, LOADS[load]) for lattice in (classic, octree)), strict=True)
     assert works[1] == pytest.approx(works[0], rel=0.045)
-    edge = octree_lattice(box_mask((8, 8, 8)), 1.0, 2, density=1e-6, scaling="edge")
+    _, edge = cubes(8, 2, "edge")
     at = numbers_in(classic, octree)
     before = answer(edge, edge.scale, LOADS[load])[1]
     if load != "twist":
@@ -137,7 +143,7 @@ def test_a_cube_with_coarse_corners_answers_with_the_forces_of_the_classic_one(l
 @pytest.mark.parametrize("load", LOADS)
 @pytest.mark.parametrize(("kind", "shape_limit"), [(0, 0.007), (1, 0.007), (2, 0.04)])
 def test_a_cube_of_17_masses_an_edge(kind, shape_limit, load):
-    classic, octree = pair(box_mask((16, 16, 16)), kind)
+    classic, octree = cubes(16, kind)
     works, shapes = zip(*(answer(lattice, lattice.scale, LOADS[load]) for lattice in (classic, octree)), strict=True)
     assert works[1] == pytest.approx(works[0], rel=0.02)
     assert surface_error(octree, shapes[1], shapes[0][numbers_in(classic, octree)]) < shape_limit
@@ -165,7 +171,7 @@ def test_other_bodies_answer_as_the_classic_lattice(mask, shape_limit):
 @pytest.mark.parametrize("kind", [0, 1])
 def test_the_lowest_frequencies_are_kept(kind):
     tones = []
-    for lattice in pair(box_mask((8, 8, 8)), kind):
+    for lattice in cubes(8, kind):
         free = np.repeat(lattice.points[:, 2] > 0.0, 3)
         mass = sp.diags_array(np.repeat(lattice.node_mass, 3)[free])
         values = spla.eigsh(stiffness(lattice, lattice.scale)[free][:, free], 4, M=mass, sigma=0.0, return_eigenvectors=False)
@@ -176,7 +182,7 @@ def test_the_lowest_frequencies_are_kept(kind):
 def test_a_push_kept_and_released_gives_the_force_and_shape_of_the_classic_lattice():
     """Three-element elements at 2 ms: force history within 1 %, shape of the surface within 1/2 %, kept and after release."""
     forces, shapes = [], []
-    classic, octree = pair(box_mask((8, 8, 8)), 0)
+    classic, octree = cubes(8, 0)
     for lattice in (classic, octree):
         engine = LatticeEngine.of(lattice, lattice_parameters(lattice, 0.02, 0.01, 0.03), step=2e-3)
         floor, top = (ConstrainedNodes.of(np.flatnonzero(lattice.points[:, 2] == z), body=b) for b, z in enumerate((0.0, 8.0)))
@@ -194,24 +200,22 @@ def test_a_push_kept_and_released_gives_the_force_and_shape_of_the_classic_latti
 
 def test_k_of_the_classes_three_times_apart_may_be_told():
     ratio, load = np.array([1.0, 3.0, 1.0]), LOADS["push"]
-    mask = box_mask((8, 8, 8))
     works = []
-    for lattice in (*pair(mask, 0), octree_lattice(mask, 1.0, 0, density=1e-6, class_stiffness=ratio)):
+    for lattice in (*cubes(8, 0), octree_lattice(box_mask((8, 8, 8)), 1.0, 0, density=1e-6, class_stiffness=ratio)):
         works.append(answer(lattice, ratio[lattice.element_class] * lattice.scale, load)[0])
     assert abs(works[2] / works[0] - 1.0) < 0.01
     assert abs(works[1] / works[0] - 1.0) < 0.05
 
 
 def test_factors_are_positive_the_same_each_time_and_one_without_coarse_cubes():
-    mask = box_mask((8, 8, 8))
-    first, second = (octree_lattice(mask, 1.0, 0, density=1e-6) for _ in range(2))
+    first, second = cubes(8, 0)[1], octree_lattice(box_mask((8, 8, 8)), 1.0, 0, density=1e-6)
     np.testing.assert_array_equal(first.scale, second.scale)
     assert first.scale.min() > 0.0
     np.testing.assert_array_equal(octree_lattice(box_mask((3, 2, 2)), 1.0, 0, density=1e-6).scale, 1.0)
 
 
 def test_symmetric_bodies_have_symmetric_factors():
-    octree = octree_lattice(box_mask((8, 8, 8)), 1.0, 0, density=1e-6)
+    _, octree = cubes(8, 0)
     known = {frozenset(map(tuple, np.rint(octree.points[e]).astype(int))): s for e, s in zip(octree.elements, octree.scale, strict=True)}
     for order, flip in (((1, 0, 2), (0, 0, 0)), ((2, 1, 0), (0, 0, 0)), ((0, 1, 2), (1, 0, 1))):
         for ends, factor in known.items():
@@ -236,7 +240,7 @@ def test_parts_that_hinge_on_an_edge_and_thin_plates_get_factors_too():
 
 
 def test_without_the_fast_solver_the_factors_are_the_same(monkeypatch):
-    known = octree_lattice(box_mask((8, 8, 8)), 1.0, 1, density=1e-6).scale
+    known = cubes(8, 1)[1].scale
     for module in ("lattices.model.octree_compliance_correction", "linear_algebra.direct", "linear_algebra.solver_selection"):
         monkeypatch.setattr(f"naibu.mechanics.{module}.pardiso_library", lambda: None)
     np.testing.assert_allclose(octree_lattice(box_mask((8, 8, 8)), 1.0, 1, density=1e-6).scale, known, rtol=1e-4)

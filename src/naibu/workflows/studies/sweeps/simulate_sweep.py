@@ -26,7 +26,7 @@ from naibu.io.study_schemas.sweep_schema import SweepFile, load_sweep
 from naibu.workflows.parallel.run_tasks import run_tasks
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers
-from naibu.workflows.results.output_folder import output_folder
+from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.checkpoint_file import CheckpointFile
 from naibu.workflows.studies.lattice_study import NAMED, prepared_document, study_tables
 from naibu.workflows.studies.simulate_lattice import SimulationRun
@@ -99,6 +99,7 @@ def prepared_sweep(source: str | os.PathLike[str]) -> PreparedSweep:
     return PreparedSweep(path.stem, path, settings, study, values, documents, quantities_of(names), fingerprint)
 
 
+@no_empty_folders()
 def simulate_sweep(
     source: str | os.PathLike[str],
     out: str | os.PathLike[str],
