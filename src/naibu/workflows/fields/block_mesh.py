@@ -22,6 +22,7 @@ CELLS = 1200  # by default
 BLURRED = 0.01  # part of the object that cubes may misrepresent without a word
 MOST_CELLS = 100_000  # of a mesh whose size is asked for: beyond, a factorization does not fit into memory
 MOST_LABEL = 65535
+BEYOND = "beyond the object"  # region of cells around it, which help to fit others to its surface and are then removed
 PLANE = 0.5  # part of a section of the object that changes its zone there: cells begin at such a plane
 # part of a zone, or of its cells, that is not the other: with 0.37 a thin skin was found 2 to 7 times too stiff
 LOST = 0.25
@@ -202,8 +203,23 @@ def moved_borders(mesh: Mesh, inside: Volume, labels: IntArray) -> tuple[MovedBo
     return tuple(out)
 
 
+class ZoneTooThin(InputError):
+    """A zone that shares too little with its cubes."""
+
+    def __init__(self, zone: str, message: str) -> None:
+        super().__init__(message)
+        self.zone = zone
+
+
 def mesh_that_shows(
-    inside: Volume, labels: IntArray, names: Mapping[int, str], sought: Collection[str], element_size_mm: float, *, exactly: bool
+    inside: Volume,
+    labels: IntArray,
+    names: Mapping[int, str],
+    sought: Collection[str],
+    element_size_mm: float,
+    *,
+    exactly: bool,
+    most: int = MOST_BY_DEFAULT,
 ) -> tuple[Mesh, IntArray]:
     """Return hexahedra as `block_mesh`, so small that zones that are sought share three quarters with their own cells.
 
@@ -215,10 +231,12 @@ def mesh_that_shows(
         Names of zones.
     exactly : bool
         Whether cells must be of that size; otherwise they may be smaller.
+    most : int
+        Cells that are made at most, those of the region `BEYOND` not counted.
 
     Raises
     ------
-    InputError
+    ZoneTooThin
         A zone that does not: what would be found for its cells is not its modulus.
     """
     size = element_size_mm
@@ -233,12 +251,18 @@ def mesh_that_shows(
         worst = max(lost, key=lambda name: lost[name], default="")
         if not lost or lost[worst] <= LOST:
             return mesh, cells
-        if exactly or mesh.n_cells > MOST_BY_DEFAULT * SMALLER**3 or size <= min(inside.spacing_mm):
-            raise InputError(
+        if exactly or _within(mesh) > most * SMALLER**3 or size <= min(inside.spacing_mm):
+            raise ZoneTooThin(
+                worst,
                 f"zone {worst!r} and its cubes of {size:.3g} mm share only {100 * (1.0 - lost[worst]):.0f} % of their volume, too little "
-                "for its modulus: choose a smaller element_size_mm, or give the zone the label of its neighbour"
+                "for its modulus: choose a smaller element_size_mm, or give the zone the label of its neighbour",
             )
         size *= SMALLER
+
+
+def _within(mesh: Mesh) -> int:
+    """Return how many cells are of the object."""
+    return mesh.n_cells - sum(int((mesh.regions == k).sum()) for k, name in enumerate(mesh.region_names) if name == BEYOND)
 
 
 def regions_of(labels: IntArray, names: Mapping[int, str]) -> IntArray:

@@ -49,6 +49,7 @@ from naibu.workflows.fields.block_mesh import (
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
 from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, relative_deformation
 from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ScannedObject, identified_on_smaller_cubes
+from naibu.workflows.fields.thin_coverings import Covering, told_left_out
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
 
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
+NO_VALUE = np.nan, 0.0, np.inf, np.nan, -1.0, 0.5  # Young's modulus, Poisson's ratio, and their bounds, of a zone that is left out
 BEYOND_KNOWN = 1e4  # times the stiffest, or part of the softest, known Young's modulus
 CELLS_OF_MAP = 2500  # of the model by default, where points are as many: finer cells than these are apart show nothing more
 LEAST_OF_MAP = 700  # cells, since maps of some hundred are searched with the whole Hessian, which takes longer
@@ -83,6 +85,8 @@ class FieldIdentification(ShownInNotebook):
         Not zero in the object.
     cell_of_voxel : ndarray, shape (nz, ny, nx), int
         Cell of the model at every voxel of it; -1 outside.
+    covering : Covering or None
+        Zones that cover the object, are thinner than cells, and are left out of the model.
     files : tuple of Path
         What was written.
     """
@@ -94,6 +98,7 @@ class FieldIdentification(ShownInNotebook):
     cautions: tuple[str, ...]
     scan: Volume
     cell_of_voxel: IntArray
+    covering: Covering | None = None
     files: tuple[Path, ...] = ()
 
     @property
@@ -201,6 +206,10 @@ def identify_fields(
     usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else min(CELLS, most)
     size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
     sought = () if each_cell else set(names.values()) - set(stated.values)
+    scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0)
+    if scanned.covering is not None:
+        sought = set(sought) & set(scanned.names.values())
+        size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
     cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])
@@ -212,6 +221,8 @@ def identify_fields(
             cubes, found = identified_on_smaller_cubes(
                 cubes, found, stated, most=min(MOST_REFINED, most), law=law, bounds=bounds, progress=progress
             )
+    if scanned.covering is not None:
+        found = told_left_out(found, scanned.covering)
     cases = cubes.load_cases
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
@@ -225,7 +236,7 @@ def identify_fields(
     doubts += tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
     coarse += cubes.noise
     notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
-    result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel)
+    result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel, scanned.covering)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
@@ -290,6 +301,8 @@ def table_of_zones(result: FieldIdentification) -> Table:
         for i, name in enumerate(found.zones.names):
             e, nu = (float(values[i]) for values in (found.young_modulus, found.poisson_ratio))
             rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i]), how[i]))
+    left_out = () if result.covering is None else result.covering.names
+    rows += [(name, *NO_VALUE, NOT_DETERMINED) for name in left_out]
     moduli = (f"Young's modulus, {result.unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
     columns = ("zone", *moduli, "Young's modulus is")
     return Table("Moduli", columns, tuple(rows))
@@ -357,6 +370,8 @@ def _volumes(result: FieldIdentification) -> tuple[FloatArray, FloatArray, Float
     """Return Young's modulus, its standard deviation, and Poisson's ratio of every voxel; NaN where there is none, 0 outside."""
     found, cells = result.estimate, result.cell_of_voxel
     young, sd, poisson = (np.where(cells >= 0, values[cells], 0.0) for values in moduli_of_cells(found))
+    if result.covering is not None:
+        young[result.covering.voxels] = sd[result.covering.voxels] = poisson[result.covering.voxels] = np.nan
     if found.uncertainty is None:
         return young, sd, poisson
     regions = zones_of_voxels(found, result.scan, cells)

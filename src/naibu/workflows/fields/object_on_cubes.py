@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,11 +21,13 @@ from naibu.identification.from_fields.forward.representation_error import with_n
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.mesh_error import one_cell_thick
-from naibu.workflows.fields.block_mesh import BLURRED, mesh_that_shows, misplaced, moved_borders, region_in, regions_of
+from naibu.identification.from_fields.verdict import LEAST_POINTS
+from naibu.workflows.fields.block_mesh import BLURRED, misplaced, moved_borders, region_in, regions_of
 from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.contradicted_measurements import without_contradicted
 from naibu.workflows.fields.known_zones import KnownZones
 from naibu.workflows.fields.measured_load_case import measured_load_case
+from naibu.workflows.fields.thin_coverings import Covering, loaded_below, mesh_on_what_is_left, without_thin_coverings
 
 MOST_REFINED = 2800  # cells that are made unasked where smaller ones change moduli: beyond, the time grows with the square of their number
 WORTHWHILE = 0.85  # of the edge length: refinement by less changes little
@@ -57,6 +59,8 @@ class ScannedObject:
         Names and measured fields.
     loaded : tuple of str
         Sides at which forces act; the whole surface where there are none.
+    covering : Covering or None
+        Zones that were left out, which are not part of `inside` and `names`.
     """
 
     inside: Volume
@@ -64,6 +68,13 @@ class ScannedObject:
     names: Mapping[int, str]
     fields: tuple[tuple[str, DisplacementField], ...]
     loaded: tuple[str, ...]
+    covering: Covering | None = None
+
+    def without_thin_coverings(self, size_mm: float, sought: Collection[str], *, exactly: bool) -> ScannedObject:
+        """Return the object without zones that are thinner than cubes of a size (see `naibu.workflows.fields.thin_coverings`)."""
+        most = int(max(int(field.valid.sum()) for _, field in self.fields) / LEAST_POINTS)
+        left, names, covering = without_thin_coverings(self.inside, self.labels, self.names, sought, size_mm, exactly=exactly, most=most)
+        return self if covering is None else replace(self, inside=left, names=names, covering=covering)
 
     @property
     def volume_mm3(self) -> float:
@@ -72,12 +83,16 @@ class ScannedObject:
 
     def on_cubes(self, size_mm: float, sought: Collection[str], *, exactly: bool, each_cell: bool) -> ObjectOnCubes:
         """Return the object on cubes of an edge length (see `mesh_that_shows`), moved onto borders of zones unless it is to be mapped."""
-        mesh, cell_of_voxel = mesh_that_shows(self.inside, self.labels, self.names, sought, size_mm, exactly=exactly)
+        covered = np.zeros(self.inside.shape, dtype=bool) if self.covering is None else self.covering.voxels
+        mesh, cell_of_voxel = mesh_on_what_is_left(self.inside, self.labels, self.names, sought, size_mm, covered, exactly=exactly)
         left_out, wrong = misplaced(mesh, cell_of_voxel, self.inside, self.labels, self.names)
-        if not each_cell and wrong >= BLURRED:
+        if not each_cell and wrong >= BLURRED and self.covering is None:
             mesh, cell_of_voxel = fitted_to_borders(mesh, cell_of_voxel, self.inside, regions_of(self.labels, self.names))
             left_out, wrong = misplaced(mesh, cell_of_voxel, self.inside, self.labels, self.names)
         all_measured = [measured_load_case(mesh, cell_of_voxel, self.inside, field, name, self.loaded) for name, field in self.fields]
+        if self.covering is not None:
+            below = loaded_below(mesh, self.covering.voxels, self.inside)
+            all_measured = [replace(case, loaded=case.loaded | below[:, None]) for case in all_measured]
         cases, outliers = zip(*map(without_contradicted, all_measured), strict=True)
         words = tuple(text for told in outliers for text in told)
         noisy = [with_noise_of_neighbours(mesh, case) if each_cell or case.field.covariance is not None else (case, 1.0) for case in cases]
