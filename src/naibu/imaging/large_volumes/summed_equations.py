@@ -40,7 +40,6 @@ from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_
 from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, blocks_alike, displacement_of_blocks
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.results.hidden_dilatation import loaded_trial_parts
-from naibu.imaging.volume_correlation.results.weight_contrasts import WeightContrast
 from naibu.imaging.volume_correlation.splines._spline_kernels import product
 from naibu.imaging.volume_correlation.volume_changes import LATE_DRAWS
 
@@ -216,20 +215,8 @@ class SummedEquations:
         fit.gain, fit.offset = self.lattice.values(model.gain)
         fit.residual_sd = model.residual_sd
         weights = coarse.bending, coarse.dilatation
-        found = collected(coarse.volume, fit, coarse.c, samples, *weights, content, sums.misfit, hidden, self._contrasts)
+        found = collected(coarse.volume, fit, coarse.c, samples, *weights, content, sums.misfit, hidden)
         return replace(found, blocks=self._small_blocks(sums.small, scale, content.unlike) if sums.small else None)
-
-    def _contrasts(self) -> tuple[WeightContrast, ...]:
-        """Return those of the coarse voxels, whose edges and parts are the same; the intensity model stays that of all voxels."""
-        coarse, fit = self.coarse, self.fit
-        kept = fit.gain, fit.offset, fit.residual_sd, fit.inclusions
-        fit.inclusions, fit.reliability = [], None
-        fit.compare(coarse.c)
-        noise, dilatation = coarse.noise(), coarse.dilatation * self.system.gauss_volume
-        self.system.assembled(coarse.c, fit.products, fit.force, coarse.bending, dilatation)
-        found = coarse.contrasts(noise, fit.noise_samples(LATE_DRAWS, noise, coarse.settings.seed + 3), settled=False)
-        fit.gain, fit.offset, fit.residual_sd, fit.inclusions = kept
-        return found
 
     def _small_blocks(self, parts: list[BlockSums], scale: float, unlike: BoolArray) -> DisplacementField:
         every, frame = BlockSums.joined(parts), self.frame

@@ -292,7 +292,7 @@ def collected(
     content: CommonContent,
     misfit: FloatArray,
     hidden: tuple[FloatArray, FloatArray],
-    contrasts: Callable[[], Sequence[WeightContrast]],
+    contrasts: Callable[[], Sequence[WeightContrast]] = tuple,
 ) -> CorrelationResult:
     """Return the result of a fit at full resolution.
 

@@ -65,8 +65,6 @@ def weight_contrasts(
     noise: ResidualNoise,
     seed: int,
     drawn: Float32Array,
-    *,
-    settled: bool = True,
 ) -> tuple[WeightContrast, ...]:
     """Return what less weight of the edges, and the voxels of each part alone, would move the field by.
 
@@ -86,8 +84,6 @@ def weight_contrasts(
         Of the random fields.
     drawn : ndarray, shape (n, 3, s)
         What `CorrelationFit.noise_samples` returns for that seed at the present weights, mm.
-    settled : bool
-        Whether the coefficients are the solution of the equations of these voxels at their present weights.
     """
     system, jitter = fit.system, (fit.jitter_voxels * fit.level.spacing.mean() / max(fit.residual_sd, 1e-30)) ** 2
 
@@ -102,12 +98,10 @@ def weight_contrasts(
     soft = np.asarray((1.0 + steep) / (1.0 + JITTIER**2 * steep), dtype=np.float32)
     for inclusion in fit.inclusions:
         soft[inclusion.voxels] = 1.0
-    here = 0.0 if settled else changed(np.ones_like(soft))[0]
     everywhere = np.ones(len(soft), dtype=bool)
     out = []
     for share, voxels, factor in [(soft, everywhere, OF_EDGES), *((part.astype(np.float32), part, 1.0) for part in parts)]:
-        moved, random = changed(share)
-        out.append(WeightContrast(np.asarray(moved - here, dtype=np.float32), random, voxels, factor))
+        out.append(WeightContrast(*changed(share), voxels, factor))
     return tuple(out)
 
 
