@@ -115,7 +115,7 @@ class SummedEquations:
         cells[tuple(self.system.cells[:, 2:].T)] = True
         rigid, depth = np.zeros(coarse.mask.shape, dtype=bool), np.zeros(coarse.mask.shape, np.float32)
         z, y, x = level.index.astype(int).T[::-1]
-        depth[z, y, x] = coarse.depth_mm(level)
+        depth[z, y, x] = level.depth_mm(coarse.mask)
         for inclusion in coarse.inclusions:
             rigid[z[inclusion.voxels], y[inclusion.voxels], x[inclusion.voxels]] = True
         views = tuple(_fine(v, factor, coarse.mask.shape, self.volume.shape) for v in coarse.views)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.aerated_tissue import aerated_tissue, meets_body, summed
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
@@ -56,13 +56,14 @@ def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
     that face. A cavity may be open to the outside, as lungs are by the trachea, through a throat much narrower than itself. Through a wide
     opening it belongs to the object if it is denser than the air outside, as aerated tissue is, and surrounded by the object.
     """
-    smooth = _smoothed(volume)
+    values = padding_as_air(volume.values)
+    smooth = _smoothed(values)
     found = smooth > _limit(smooth)
     labels, _ = ndimage.label(found)
     found = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
     pad = CLOSING + 1
     found = ndimage.binary_closing(np.pad(found, pad), iterations=CLOSING)[pad:-pad, pad:-pad, pad:-pad]
-    found = _with_cavities(found, volume)
+    found = _with_cavities(found, values, volume.spacing_mm)
     return np.asarray(ndimage.binary_dilation(found, iterations=margin) if margin else found)
 
 
@@ -74,12 +75,12 @@ def object_threshold(volume: Volume) -> float:
     InputError
         Volume without contrast.
     """
-    return _limit(_smoothed(volume))
+    return _limit(_smoothed(padding_as_air(volume.values)))
 
 
-def _smoothed(volume: Volume) -> Float32Array:
-    reach = tuple(SMOOTHING if n > 1 else 0.0 for n in volume.shape)
-    return np.asarray(ndimage.gaussian_filter(np.asarray(padding_as_air(volume.values), dtype=np.float32), reach))
+def _smoothed(values: AnyFloatArray) -> Float32Array:
+    reach = tuple(SMOOTHING if n > 1 else 0.0 for n in values.shape)
+    return np.asarray(ndimage.gaussian_filter(np.asarray(values, dtype=np.float32), reach))
 
 
 def _limit(smooth: Float32Array) -> float:
@@ -169,7 +170,7 @@ def left_out(volume: Volume, mask: BoolArray, view: Box) -> LeftOut:
         Field of view of the scan.
     """
     inside = mask[view]
-    smooth = _smoothed(Volume.from_array(volume.values[view], spacing_mm=volume.spacing_mm))
+    smooth = _smoothed(padding_as_air(np.asarray(volume.values[view])))
     dark = smooth <= _limit(smooth)
     surrounded = dark & ~inside & (meets_body(inside) >= SURROUNDED)
     # the outline is closed, and what is blurred about it is bright
@@ -178,15 +179,15 @@ def left_out(volume: Volume, mask: BoolArray, view: Box) -> LeftOut:
     return LeftOut(float(surrounded.sum()) / size, float((~dark & ~near).sum()) / size)
 
 
-def _with_cavities(bright: BoolArray, volume: Volume) -> BoolArray:
+def _with_cavities(bright: BoolArray, values: AnyFloatArray, spacing_mm: FloatArray) -> BoolArray:
     """Return the bright region with the cavities that it encloses, also those that are open through a throat."""
     outside = _from_outside(~bright, ~bright)
-    voxel = max((bright.size * float(np.prod(volume.spacing_mm)) / THROAT_VOXELS) ** (1 / 3), float(volume.spacing_mm.min()))
-    stride = np.maximum(np.round(voxel / volume.spacing_mm[::-1]), 1).astype(int)
+    voxel = max((bright.size * float(np.prod(spacing_mm)) / THROAT_VOXELS) ** (1 / 3), float(spacing_mm.min()))
+    stride = np.maximum(np.round(voxel / spacing_mm[::-1]), 1).astype(int)
     # coarse voxels are bright where any of theirs is: thin walls stay closed
     blocked = summed(~outside, stride) > 0
-    cavities = aerated_tissue(padding_as_air(volume.values), bright, outside, stride)
-    cavities |= _through_throats(blocked | cavities, volume.spacing_mm[::-1] * stride)
+    cavities = aerated_tissue(values, bright, outside, stride)
+    cavities |= _through_throats(blocked | cavities, spacing_mm[::-1] * stride)
     if cavities.any():
         fine = cavities.repeat(stride[0], 0).repeat(stride[1], 1).repeat(stride[2], 2)[tuple(map(slice, bright.shape))]
         fine = ndimage.binary_dilation(fine & outside, iterations=int(stride.max()) + 1, mask=outside)

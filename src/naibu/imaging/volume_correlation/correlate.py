@@ -17,10 +17,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage
 from threadpoolctl import threadpool_limits
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array
@@ -28,6 +28,7 @@ from naibu.core.errors import InputError
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
+from naibu.imaging.preprocessing.intensity_parts import intensity_parts
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.resampling import require_mask
 from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated, require_convergence, require_overlap
@@ -46,6 +47,7 @@ from naibu.imaging.volume_correlation.results.block_displacements import block_d
 from naibu.imaging.volume_correlation.results.cell_errors import misplacement_variance
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.results.hidden_dilatation import TrialParts, hidden_dilatation, loaded_trial_parts
+from naibu.imaging.volume_correlation.results.weight_contrasts import WeightContrast, weight_contrasts
 from naibu.imaging.volume_correlation.rigid_parts.inclusion_candidates import LEAST_VOLUME, inclusion_candidates
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion, rigid_inclusions_among
 from naibu.imaging.volume_correlation.rigid_parts.rigid_initialization import RigidInitialization, correlated_shift
@@ -65,7 +67,6 @@ from naibu.imaging.volume_correlation.volume_changes import (
 from naibu.imaging.volume_correlation.volumes_and_masks import LEAST_SIZE, check_shape, filled_pair, labelled
 
 # No derivation stands behind the numbers below: they are empirical, and benchmarks/sense_volumes.py shows the effect of a change.
-VOXELS_PER_LONG_CELL = 2.5  # least number of voxels along a cell on the axis of the largest spacing
 # an affine motion is tried where the outline is stretched by so much, and taken if its correlation is higher by so much
 LEAST_STRETCH, LEAST_GAIN = 0.15, 0.05
 FIRST_DILATATION = 0.1  # of the dilatation weight, before it is adapted: a field that is penalised too much does not show its dilatation
@@ -198,7 +199,7 @@ class Correlation:
         if ((high - low + 1) < LEAST_SIZE).any():
             raise InputError(f"mask spans {(high - low + 1).tolist()} voxels along x, y, z; {LEAST_SIZE} or more are needed")
         self.spacing = reference.spacing_mm
-        self.step = _step(settings, self.mask, self.spacing)
+        self.step = settings.cell_size_mm(float(self.mask.sum()), self.spacing)
         margin = 1.5 * self.spacing
         self.grid = SplineGrid.around(low * self.spacing - margin, high * self.spacing + margin, self.step, halvings=HALVINGS)
         self.strides = _strides(self.step, self.spacing)
@@ -398,13 +399,12 @@ class Correlation:
         penalties = system.bending_load(self.c, self.bending) + system.dilatation_load(self.c, self.dilatation * system.gauss_volume)
         return hidden_dilatation(self.fit, self.c, *tried, noise, some, -penalties, robust)
 
-    def depth_mm(self, level: ImageLevel) -> Float32Array:
-        """Return the distance (n,) of the listed voxels of the finest level from the surface, mm; the ends of the volume are none."""
-        low, high = np.maximum(level.low - 1, 0), level.high + 1
-        box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
-        inner = tuple(slice(int(a), int(b)) for a, b in zip(level.low - low, level.high - low, strict=True))
-        depth = ndimage.distance_transform_edt(self.mask[box], sampling=self.spacing[::-1])
-        return np.asarray(depth[inner][level.mask], dtype=np.float32)
+    def contrasts(self, noise: ResidualNoise, drawn: Float32Array) -> tuple[WeightContrast, ...]:
+        """Return the contrasts of weights, given noise and what `CorrelationFit.noise_samples` draws of it for `hidden`."""
+        fit, shown = self.fit, Volume.from_array(self.reference, spacing_mm=self.spacing)
+        parts = [fit.level.listed(part) for part in intensity_parts(shown, self.mask)]
+        penalties = self.bending, self.dilatation * fit.system.gauss_volume
+        return weight_contrasts(fit, self.c, penalties, parts, noise, self.settings.seed + 3, drawn)
 
     def result(self) -> CorrelationResult:
         """Draw the covariance, and return the result."""
@@ -417,26 +417,19 @@ class Correlation:
         system.assembled(self.c, fit.products, fit.force, self.bending, dilatation, system.matrix, voxels=False)  # of the intensities
         require_overlap(float(fit.seen.mean()))
         refuse_unrelated(fit)
-        content = common_content(fit, self.depth_mm(fit.level))
+        content = common_content(fit, fit.level.depth_mm(self.mask))
         content.refuse_chance(system.inner)
         require_convergence(fit.moving_fraction)
         for inclusion in self.inclusions:
             inclusion.draws.clear()
         noise = self.noise()
-        hidden = self.hidden(tried, fit.noise_samples(LATE_DRAWS, noise, self.settings.seed + 3), noise.scale)
+        drawn = fit.noise_samples(LATE_DRAWS, noise, self.settings.seed + 3)
+        hidden = self.hidden(tried, drawn, noise.scale)
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
         blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2, content.unlike)
-        found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content, fit.cell_misfit(), hidden)
+        contrasts = partial(self.contrasts, noise, drawn)
+        found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content, fit.cell_misfit(), hidden, contrasts)
         return replace(found, blocks=blocks)
-
-
-def _step(settings: CorrelationSettings, mask: BoolArray, spacing: FloatArray) -> FloatArray:
-    """Return the size of the finest cells along x, y, z, mm."""
-    if settings.node_spacing_mm is not None:
-        return np.full(3, float(settings.node_spacing_mm))
-    voxel = float(np.prod(spacing))
-    h = max((float(mask.sum()) * voxel) ** (1 / 3) / settings.cells_along, settings.voxels_per_cell * voxel ** (1 / 3))
-    return np.asarray(np.maximum(h, VOXELS_PER_LONG_CELL * spacing))
 
 
 def _stride(step: FloatArray, spacing: FloatArray, part: int) -> tuple[int, ...]:

@@ -218,12 +218,16 @@ class CorrelationFit(IntensityComparison):
 
     def noise_samples(self, count: int, noise: ResidualNoise, seed: int) -> Float32Array:
         """Return random coefficients (n, 3, count), mm, that residuals of noise alone would leave, at the penalties last assembled."""
+        return self.system.solved_many(self.noise_loads(count, noise, seed), SAMPLE_TOLERANCE)[0]
+
+    def noise_loads(self, count: int, noise: ResidualNoise, seed: int, share: Float32Array | None = None) -> Float32Array:
+        """Return the loads (n, 3, count) of the residuals of which `noise_samples` are, with a `share` (n,) of the weights of voxels."""
         sensitivity = self.gradient * np.sqrt(self.weight)[:, None]
+        if share is not None:
+            sensitivity *= share[:, None]
         for inclusion in self.inclusions:
             sensitivity[inclusion.voxels] = 0
-        rng = np.random.default_rng((seed, count))
-        loads = self.system.random_loads(sensitivity, noise.draws(rng, count))
-        return self.system.solved_many(loads, SAMPLE_TOLERANCE)[0]
+        return self.system.random_loads(sensitivity, noise.draws(np.random.default_rng((seed, count)), count))
 
     def _random_loads(self, sensitivity: Float32Array, count: int, noise: ResidualNoise | None, rng: np.random.Generator) -> Float32Array:
         if noise is not None and not self.inclusions:

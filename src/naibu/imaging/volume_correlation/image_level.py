@@ -99,6 +99,19 @@ class ImageLevel:
         at = positions_mm / self.spacing - self.first
         return np.asarray(((at >= -0.5) & (at <= np.array(self.deformed.shape[::-1]) - 3 - 0.5)).all(axis=1))
 
+    def depth_mm(self, mask: BoolArray) -> Float32Array:
+        """Return the distance (n,), mm, of the listed voxels from the surface of a mask of all voxels; the ends of the volume are none."""
+        low, high = np.maximum(self.low - 1, 0), self.high + 1
+        box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
+        inner = tuple(slice(int(a), int(b)) for a, b in zip(self.low - low, self.high - low, strict=True))
+        depth = ndimage.distance_transform_edt(mask[box], sampling=self.spacing[::-1])
+        return np.asarray(depth[inner][self.mask], dtype=np.float32)
+
+    def listed(self, values: BoolArray) -> BoolArray:
+        """Return the values (n,) of an image (nz, ny, nx), on the grid of this level, at the listed voxels."""
+        z, y, x = self.index.astype(int).T[::-1]
+        return values[z, y, x]
+
     @property
     def axes_mm(self) -> list[FloatArray]:
         """Coordinates of the voxels of the box along x, y, z, mm."""

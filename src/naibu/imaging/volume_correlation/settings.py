@@ -7,12 +7,13 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from naibu.core.arrays import require_positive
+from naibu.core.arrays import FloatArray, require_positive
 from naibu.core.errors import InputError
 
 Gradients = Literal["reference", "mean", "deformed"]
 # fraction of the image intensity gradient that is taken from the reference
 REFERENCE_FRACTION: dict[Gradients, float] = {"reference": 1.0, "mean": 0.5, "deformed": 0.0}
+VOXELS_PER_LONG_CELL = 2.5  # empirical: least number of voxels along a cell on the axis of the largest spacing
 LEAST_SAMPLES = 8  # a 3 x 3 covariance of fewer is too uncertain to weight data by
 
 
@@ -102,3 +103,11 @@ class CorrelationSettings:
                 raise InputError(f"{name} must be 0 or more, voxels, not {value}")
         if self.seed < 0:
             raise InputError(f"seed must be 0 or more, not {self.seed}")
+
+    def cell_size_mm(self, voxels: float, spacing_mm: FloatArray) -> FloatArray:
+        """Return the size (3,) of the finest cells along x, y, z, mm, for an object of so many voxels with a spacing (3,), mm."""
+        if self.node_spacing_mm is not None:
+            return np.full(3, float(self.node_spacing_mm))
+        voxel = float(np.prod(spacing_mm))
+        h = max((voxels * voxel) ** (1 / 3) / self.cells_along, self.voxels_per_cell * voxel ** (1 / 3))
+        return np.asarray(np.maximum(h, VOXELS_PER_LONG_CELL * spacing_mm))

@@ -40,7 +40,7 @@ def sampled_covariance(fit: CorrelationFit, samples: Float32Array) -> FloatArray
         Random coefficients about those of the fit, mm.
     """
     system = fit.system
-    cells, at = _some_voxels(fit)
+    cells, at = some_voxels(fit)
     full = np.zeros((*system.active.shape, *samples.shape[1:]), np.float32)
     full[system.active] = samples
     moves = system.grid.values(full, fit.level.index[at] * fit.level.spacing)
@@ -77,7 +77,7 @@ def bias_covariance(fit: CorrelationFit, bias: Sequence[Float32Array], sampled: 
     It is taken at voxels: the middle of a cell at the surface may lie far outside of the object, where splines extrapolate.
     """
     system = fit.system
-    cells, at = _some_voxels(fit)
+    cells, at = some_voxels(fit)
     full, m = np.zeros((*system.active.shape, 3)), len(system.cells)
     total = np.zeros((m, 3, 3))
     for coefficients in bias:
@@ -124,7 +124,7 @@ def strain_variance(fit: CorrelationFit, c: FloatArray, samples: Float32Array, b
     zero, deformation = np.zeros(len(fit.system.cells)), deformation_at_middles(fit, c)
     drawn = sum((strain_square(deformation, gradients_of(fit, samples[..., s])) for s in range(samples.shape[2])), start=zero)
     biased = sum((strain_square(deformation, gradients_of(fit, coefficients)) for coefficients in bias), start=zero)
-    return _averaged(fit, drawn / samples.shape[2] + 3.0 * biased)
+    return averaged(fit, drawn / samples.shape[2] + 3.0 * biased)
 
 
 def deformation_at_middles(fit: CorrelationFit, c: FloatArray) -> FloatArray:
@@ -162,12 +162,12 @@ def _gradients_at_middles(fit: CorrelationFit, c: FloatArray) -> FloatArray:
     return out
 
 
-def _averaged(fit: CorrelationFit, values: FloatArray) -> FloatArray:
+def averaged(fit: CorrelationFit, values: FloatArray) -> FloatArray:
     """Return values (m,) of the cells averaged with those of their neighbours."""
     return np.asarray(fit.windowed(values, SHARED) / fit.windowed(np.ones_like(values), SHARED))
 
 
-def _some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
+def some_voxels(fit: CorrelationFit) -> tuple[IntArray, IntArray]:
     """Return cells and listed voxels of the object, a few of them spread over every cell."""
     every = fit.cell_of_voxel
     here = np.flatnonzero(fit.within | ~np.bincount(every, fit.within, minlength=len(fit.system.cells)).astype(bool)[every])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +27,7 @@ from naibu.imaging.volume_correlation.results.cell_errors import (
     strain_variance,
     variance_of_one_line,
 )
+from naibu.imaging.volume_correlation.results.weight_contrasts import WeightContrast, contrast_errors
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import InclusionMotion
 from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable_slice
 
@@ -52,8 +53,8 @@ class CorrelationResult:
         Standard deviation of a component of the Green-Lagrange strain in the middle of every cell, root mean square over the components;
         NaN where there is no object.
     cell_bias : ndarray, shape (CZ, CY, CX)
-        Variance, mm^2, of the bias by the penalties along an axis, in the mean over three, a part of the covariance; NaN where there is no
-        object.
+        Variance, mm^2, along an axis, in the mean over three, of the bias by the penalties and of the errors that edges or parts of the
+        object share, a part of the covariance; NaN where there is no object.
     cell_misplacement : ndarray, shape (CZ, CY, CX)
         Variance along every axis, mm^2, of displacements that would explain residuals far above the noise, a part of the covariance: 0
         where structures lie on one another after registration, NaN where there is no object.
@@ -291,11 +292,13 @@ def collected(
     content: CommonContent,
     misfit: FloatArray,
     hidden: tuple[FloatArray, FloatArray],
+    contrasts: Callable[[], Sequence[WeightContrast]] = tuple,
 ) -> CorrelationResult:
     """Return the result of a fit at full resolution.
 
     `samples` (n, 3, s) are random coefficients about c. Soft cells whose content is not in both volumes are not answered. `misfit` (m, 3)
-    is that of `CorrelationFit.cell_misfit` at full resolution, and `hidden` two variances (m,): those of `hidden_dilatation`.
+    is that of `CorrelationFit.cell_misfit` at full resolution, and `hidden` two variances (m,): those of `hidden_dilatation`. `contrasts`
+    gives those of `weight_contrasts`, once the assembled equations are needed no more.
 
     Notes
     -----
@@ -304,7 +307,9 @@ def collected(
     more. Its direction is known only in part: what a penalty took from the true field was not parallel to what it takes from its estimate,
     but is large where the samples are, too, in the directions that the intensities leave open: see `bias_covariance`. What a part may have
     swollen by while noise hides it, and what large residuals tell of structures that no smooth field brings together, such as those on
-    either side of organs that slide on each other, are added as variances along every axis.
+    either side of organs that slide on each other, are added as variances along every axis. Errors that edges, or the parts of an object,
+    have in common lie along what other weights of their voxels would move the field by: see
+    `naibu.imaging.volume_correlation.results.weight_contrasts`.
     """
     system, level = fit.system, fit.level
     # the errors first: they take memory for every voxel of the object, and the fields below stay
@@ -313,12 +318,14 @@ def collected(
     misplaced = misplacement_variance(fit, misfit, content.unlike)
     sampled = sampled_covariance(fit, samples)
     taken = bias_covariance(fit, bias, sampled)
+    shared, strained = contrast_errors(fit, c, contrasts())
+    taken += shared
     others = sampled + taken + (remaining + misplaced)[:, None, None] * np.eye(3)
     lost = variance_of_one_line(hidden[0], np.trace(others, axis1=1, axis2=2) / 3.0)
     biased = np.trace(taken, axis1=1, axis2=2) / 3.0 + lost
     covariance = per_cell(system.grid, fit, others + lost[:, None, None] * np.eye(3))
     strain_sd = np.sqrt(
-        strain_variance(fit, c, samples, bias) + hidden[1] + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
+        strain_variance(fit, c, samples, bias) + hidden[1] + strained + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
     )
     return_freed_memory()
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
