@@ -150,7 +150,7 @@ def identify_field(
     automatic: RegularizationName | None = "total_variation" if zones.count > FEW else None
     name = automatic if regularization == "automatic" else regularization
     of_map: FieldElements = "as_given" if name is not None and mesh.cell_type == "tetra" else elements
-    model = FieldModel(mesh, load_cases, zones, law, of_map)
+    model = FieldModel(mesh, load_cases, zones, law, of_map, progress)
     within = region_at if name is None else None
     recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, within, tuple(borders), other_mesh)
     point = recipe.start(start)
@@ -204,7 +204,7 @@ class _Recipe:
         """Return the model with the elements of the mesh as they are, where these cost less and lead to a start as well."""
         if self.model.computed is self.model.mesh:
             return self.model
-        return FieldModel(self.model.mesh, self.load_cases, self.model.zones, self.law, "as_given")
+        return FieldModel(self.model.mesh, self.load_cases, self.model.zones, self.law, "as_given", self.progress)
 
     def free(self, point: Point) -> FieldEstimate:
         """Fit the zones without a penalty."""
@@ -349,7 +349,7 @@ class _Recipe:
         """Return the fit of regions, with accurate elements where those of the map were not and such a body is not too large."""
         model = self.model.with_zones(zones)
         if self.elements == "accurate" and not model.averaged and model.mesh.dimension == 3:
-            accurate = FieldModel(model.mesh, self.load_cases, zones, self.law, "accurate")
+            accurate = FieldModel(model.mesh, self.load_cases, zones, self.law, "accurate", self.progress)
             if accurate.points.size <= MOST_UNKNOWNS:
                 found = search(accurate, first_point(accurate, point.theta), Objective(bounds=self.bounds))
                 self.record(f"fit of {zones.count} regions with quadratic elements: misfit {found.point.misfit:.4g}")
