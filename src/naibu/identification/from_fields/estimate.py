@@ -68,7 +68,7 @@ from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.surface_bias import bias_of_surface
 from naibu.identification.from_fields.surface_noise import SurfaceNoise
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
-from naibu.identification.from_fields.verdict import inflation, verdict, with_enough_points
+from naibu.identification.from_fields.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
 from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
 from naibu.identification.load_case import require_load_cases
 
@@ -400,12 +400,14 @@ class _Recipe:
             covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
             of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
         best, (bias, left) = theta, bias_of_surface(at, quadratic, variance, noise.information)
-        total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
+        unsaid = np.repeat([0.0, 0.0 if tells_poisson(model) else AT_BOUND], len(theta) // 2)
+        total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2 + unsaid**2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
         judged = with_limits(judged, names, by_elements, intervals(theta, total)[0], model.zones.unit)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         limits = (TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1])) if coarse else ()
+        limits += () if tells_poisson(model) else (FEW_POINTS,)
         words = statement(judged, model.zones, theta, total, others, limits=limits, budget=budget)
         states = tuple(u[: model.mesh.n_points] for u in point.states)
         borders, parts = (None, None) if refined is None else (refined.borders, refined.parts)

@@ -25,6 +25,7 @@ BOUNDARY_TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-3  # relative residuals; the latt
 EXACT_TRACE, PROBES = 1200, 64  # components up to which a trace is computed as it is; random vectors that estimate it beyond
 BOUNDARY_ITERATIONS = 200
 REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
+WORTH = 2  # columns times iterations, over loaded components, with the Hessian of an earlier point, after which it is made anew
 AT_ONCE = 4  # iterations from which so many columns cost more with the Hessian of an earlier point than one made anew
 
 

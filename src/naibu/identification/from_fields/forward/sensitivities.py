@@ -29,7 +29,7 @@ from naibu.identification.from_fields.forward.loaded_components import (
     BLOCK,
     BOUNDARY_TOLERANCE,
     REFRESHED,
-    ROUGH_TOLERANCE,
+    WORTH,
     BoundaryPreconditioner,
     KeptPreconditioners,
     Solved,
@@ -40,6 +40,7 @@ from naibu.identification.from_fields.forward.loaded_components import (
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
+FIRST_TOLERANCE = 1e-4  # of the motion of the surface with which a search at finite strain begins
 TOLD = 10  # products of a linearisation from one report to the next: of thousands of cells and many columns, some seconds
 Gradient = tuple[FloatArray, list[FloatArray]]  # with respect to theta, and to the sought displacements of every load case
 
@@ -353,7 +354,7 @@ class Linearised:
         try:
             local = [local_preconditioner(o) for o in self.model.observed]
             return conjugate_gradients(
-                self._loaded_product, lambda r: [f.solve(b) for f, b in zip(local, r, strict=True)], list(right), ROUGH_TOLERANCE
+                self._loaded_product, lambda r: [f.solve(b) for f, b in zip(local, r, strict=True)], list(right), FIRST_TOLERANCE
             ).solution
         except ConvergenceError:  # measurements far from the surface
             return self.loaded_solved(right)
@@ -361,7 +362,7 @@ class Linearised:
     def renew_if_due(self, columns: int) -> None:
         """Have preconditioners made at this point before systems of so many columns, where others have cost or would cost more."""
         kept, most = self.model.boundary, sum(len(o.unknown) for o in self.model.observed)
-        if not self._fresh and (columns * AT_ONCE > most or kept.spent > most):
+        if not self._fresh and (columns * AT_ONCE > most or kept.spent > WORTH * most):
             kept.forget()
 
     def _tell(self) -> None:
