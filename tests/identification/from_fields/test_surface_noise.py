@@ -15,6 +15,8 @@ from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, moduli_of
 from naibu.identification.from_fields.mesh_error import changes_of_motions, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.surface_noise import CorrectedInformation, DrawnMotions
+from naibu.identification.from_fields.uncertainty import intervals
+from naibu.identification.from_fields.verdict import FEW_POINTS
 
 SOME, PAIRS = 300, 12
 
@@ -104,3 +106,17 @@ def test_too_few_points_for_the_cells_of_a_body_whose_surface_is_sought_are_told
     plates = exact.loaded & (np.isclose(mesh.points[:, 2:], 0.0) | np.isclose(mesh.points[:, 2:], SIDE_MM))
     known_free = identify_field(mesh, [replace(exact, field=field, loaded=plates)], zones, elements="as_given")
     assert "cells" not in known_free.identifiability[0]
+
+
+@pytest.mark.parametrize(("points", "told"), [(100, True), (50, False)])
+def test_fewer_points_than_half_the_cells_say_nothing_of_poissons_ratio(points: int, told: bool) -> None:
+    """They leave the motion of the surface to its smoothness, which draws Poisson's ratio up by as much as its interval."""
+    mesh, zones, exact = gel_on_a_pad()  # 125 cells
+    vectors = exact.field.vectors[:points] + 0.1 * SD_MM * np.random.default_rng(4).standard_normal((points, 3))
+    field = DisplacementField.from_arrays(exact.field.points[:points], vectors, sd_mm=0.1 * SD_MM)
+    found = identify_field(mesh, [replace(exact, field=field)], zones, elements="as_given")
+    assert found.uncertainty is not None
+    young, poisson = intervals(found.theta, found.uncertainty)
+    assert young[0, 0] < 5.0 < young[0, 1] < np.inf and poisson[0, 0] < 0.45 < poisson[0, 1]
+    assert (FEW_POINTS not in found.identifiability) == told == (poisson[0, 0] > 0.0)
+    assert found.verdict is not None and found.verdict.ok

@@ -68,7 +68,7 @@ from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.surface_bias import bias_of_surface
 from naibu.identification.from_fields.surface_noise import SurfaceNoise
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
-from naibu.identification.from_fields.verdict import inflation, verdict, with_enough_points
+from naibu.identification.from_fields.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
 from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
 from naibu.identification.load_case import require_load_cases
 
@@ -150,7 +150,7 @@ def identify_field(
     automatic: RegularizationName | None = "total_variation" if zones.count > FEW else None
     name = automatic if regularization == "automatic" else regularization
     of_map: FieldElements = "as_given" if name is not None and mesh.cell_type == "tetra" else elements
-    model = FieldModel(mesh, load_cases, zones, law, of_map)
+    model = FieldModel(mesh, load_cases, zones, law, of_map, progress)
     within = region_at if name is None else None
     recipe = _Recipe(model, tuple(load_cases), law, elements, bounds or Bounds(), [], progress, within, tuple(borders), other_mesh)
     point = recipe.start(start)
@@ -204,7 +204,7 @@ class _Recipe:
         """Return the model with the elements of the mesh as they are, where these cost less and lead to a start as well."""
         if self.model.computed is self.model.mesh:
             return self.model
-        return FieldModel(self.model.mesh, self.load_cases, self.model.zones, self.law, "as_given")
+        return FieldModel(self.model.mesh, self.load_cases, self.model.zones, self.law, "as_given", self.progress)
 
     def free(self, point: Point) -> FieldEstimate:
         """Fit the zones without a penalty."""
@@ -349,7 +349,7 @@ class _Recipe:
         """Return the fit of regions, with accurate elements where those of the map were not and such a body is not too large."""
         model = self.model.with_zones(zones)
         if self.elements == "accurate" and not model.averaged and model.mesh.dimension == 3:
-            accurate = FieldModel(model.mesh, self.load_cases, zones, self.law, "accurate")
+            accurate = FieldModel(model.mesh, self.load_cases, zones, self.law, "accurate", self.progress)
             if accurate.points.size <= MOST_UNKNOWNS:
                 found = search(accurate, first_point(accurate, point.theta), Objective(bounds=self.bounds))
                 self.record(f"fit of {zones.count} regions with quadratic elements: misfit {found.point.misfit:.4g}")
@@ -400,12 +400,14 @@ class _Recipe:
             covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
             of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
         best, (bias, left) = theta, bias_of_surface(at, quadratic, variance, noise.information)
-        total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2))
+        unsaid = np.repeat([0.0, 0.0 if tells_poisson(model) else AT_BOUND], len(theta) // 2)
+        total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2 + unsaid**2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
         judged = with_limits(judged, names, by_elements, intervals(theta, total)[0], model.zones.unit)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         limits = (TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1])) if coarse else ()
+        limits += () if tells_poisson(model) else (FEW_POINTS,)
         words = statement(judged, model.zones, theta, total, others, limits=limits, budget=budget)
         states = tuple(u[: model.mesh.n_points] for u in point.states)
         borders, parts = (None, None) if refined is None else (refined.borders, refined.parts)

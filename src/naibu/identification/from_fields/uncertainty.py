@@ -19,7 +19,7 @@ from naibu.identification.from_fields.inversion.truncated_newton import Regulari
 from naibu.identification.verdict import UNDETERMINED
 
 UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the information below which a combination is not determined at all
-PROBES = 24
+PROBES, RESOLUTION_SOLVED = 24, 0.03  # random vectors, and what solutions leave of them: less than what so few leave in doubt
 UNBOUNDED = 1e3  # a factor between estimate and bound beyond which the data give no bound
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
 POISSON_POORLY = 0.1
@@ -141,7 +141,7 @@ def resolution(at: Linearised, objective: Objective, *, explicit: bool, probes: 
     signs = rng.choice([-1.0, 1.0], size=(probes, size)).T
     # (A + P)^-1 A s = s - (A + P)^-1 P s, the loaded components following
     right = [curvature @ signs, *(np.zeros((len(o.unknown), probes)) for o in at.model.observed)]
-    lost = conjugate_gradients(system.product, system.preconditioned, right, 1e-2, 200)[0][0]
+    lost = conjugate_gradients(system.product, system.preconditioned, right, RESOLUTION_SOLVED, 200)[0][0]
     return np.asarray((signs * (signs - lost)).mean(axis=1))
 
 

@@ -12,7 +12,10 @@ import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
+from naibu.core.progress import report_progress
 from naibu.identification.from_fields.forward.forward_model import Observed
+from naibu.mechanics.linear_algebra.direct import direct_solver
+from naibu.mechanics.linear_algebra.protocols import Factorization
 
 if TYPE_CHECKING:
     from naibu.identification.from_fields.forward.sensitivities import Linearised
@@ -22,6 +25,7 @@ BOUNDARY_TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-3  # relative residuals; the latt
 EXACT_TRACE, PROBES = 1200, 64  # components up to which a trace is computed as it is; random vectors that estimate it beyond
 BOUNDARY_ITERATIONS = 200
 REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
+WORTH = 2  # columns times iterations, over loaded components, with the Hessian of an earlier point, after which it is made anew
 AT_ONCE = 4  # iterations from which so many columns cost more with the Hessian of an earlier point than one made anew
 
 
@@ -50,6 +54,7 @@ class BoundaryPreconditioner:
         factor, border, n_b = at.point.factors[t], at.border(t), len(o.unknown)
         hessian = np.empty((n_b, n_b))
         for start in range(0, n_b, BLOCK):
+            report_progress(at.model.progress, "finding how the body follows its surface", done=start, total=n_b)
             stop = min(start + BLOCK, n_b)
             force = border[start:stop].T.toarray()
             force[o.loaded] = 0.0
@@ -79,6 +84,22 @@ class BoundaryPreconditioner:
     def unscaled(self, b: FloatArray) -> FloatArray:
         """Return the solution (n_b, r) with the factor, before it is divided by `scale`."""
         return np.asarray(sl.cho_solve(self.factor, b, check_finite=False))  # the check would cost as much as the solution
+
+
+def local_preconditioner(o: Observed) -> Factorization:
+    """Return the Hessian (n_b, n_b) of the loaded components with all other nodes at rest, factorized, 1/mm^2.
+
+    It is sparse, and its inverse is up to some ten times too large for motions that reach far into the body: for a few columns that takes
+    fewer solutions than to make a `BoundaryPreconditioner`.
+
+    Raises
+    ------
+    ConvergenceError
+        Measurements next to the loaded nodes do not fix how these move as a whole.
+    """
+    at_rest = sp.bsr_matrix(o.basis.T @ o.information[o.loaded][:, o.loaded] @ o.basis + o.prior, blocksize=(1, 1))
+    at_rest.sort_indices()
+    return direct_solver(at_rest, symmetric=True).factorize(at_rest)
 
 
 def _trace_of_prior(cholesky: tuple[FloatArray, bool], prior: sp.csr_matrix) -> float:
@@ -128,10 +149,6 @@ class KeptPreconditioners:
         """Have all made anew on their next use."""
         self.made[:], self.spent = [None] * len(self.made), 0
 
-    def take(self, other: KeptPreconditioners) -> None:
-        """Take those of a model of the same load cases under another law."""
-        self.made[:], self.informed[:], self.spent = other.made, other.informed, other.spent
-
     def keep(self, t: int, found: BoundaryPreconditioner) -> None:
         """Keep the one of load case `t`."""
         self.made[t], self.informed[t] = found, found.informed
@@ -151,8 +168,9 @@ def conjugate_gradients(
     precondition: Callable[[list[FloatArray]], list[FloatArray]],
     right: list[FloatArray],
     tolerance: float = BOUNDARY_TOLERANCE,
+    near: Sequence[FloatArray] | None = None,
 ) -> Solved:
-    """Solve independent systems of several load cases, every column by its own iteration, all advanced together.
+    """Solve independent systems of several load cases, every column by its own iteration, all advanced together, from solutions `near`.
 
     Raises
     ------
@@ -163,20 +181,28 @@ def conjugate_gradients(
     def dot(a: list[FloatArray], b: list[FloatArray]) -> list[FloatArray]:
         return [np.einsum("ij,ij->j", p, q) for p, q in zip(a, b, strict=True)]
 
-    x, r = [np.zeros_like(b) for b in right], [b.copy() for b in right]
+    if near is None:
+        x, r = [np.zeros_like(b) for b in right], [b.copy() for b in right]
+    else:
+        x = [a.copy() for a in near]
+        r = [b - a for b, a in zip(right, product(x), strict=True)]
     target = [tolerance * np.linalg.norm(b, axis=0) for b in right]
     p, rz = [np.zeros_like(b) for b in right], [np.ones(b.shape[1]) for b in right]
     for iteration in range(BOUNDARY_ITERATIONS):
-        if all((np.linalg.norm(a, axis=0) <= limit).all() for a, limit in zip(r, target, strict=True)):
+        above = [np.linalg.norm(a, axis=0) > limit for a, limit in zip(r, target, strict=True)]
+        left = np.flatnonzero(np.any(above, axis=0))  # columns that are not solved in every load case
+        if not len(left):
             return Solved(x, r, iteration)
-        z = precondition(r)
-        new = dot(r, z)
-        for t in range(len(p)):
-            p[t] = z[t] + p[t] * (new[t] / np.maximum(rz[t], 1e-300) if iteration else 0.0)
-        q = product(p)
-        for t, curvature in enumerate(dot(p, q)):
+        open_ = [a[:, left] for a in r]
+        z = precondition(open_)
+        new = dot(open_, z)
+        directions = []
+        for t, (one, product_rz) in enumerate(zip(z, new, strict=True)):
+            directions.append(one + p[t][:, left] * (product_rz / np.maximum(rz[t][left], 1e-300) if iteration else 0.0))
+        q = product(directions)
+        for t, curvature in enumerate(dot(directions, q)):
             alpha = new[t] / np.where(curvature > 0.0, curvature, np.inf)
-            x[t] += alpha * p[t]
-            r[t] -= alpha * q[t]
-        rz = new
+            x[t][:, left] += alpha * directions[t]
+            r[t][:, left] -= alpha * q[t]
+            p[t][:, left], rz[t][left] = directions[t], new[t]
     raise ConvergenceError(f"the displacement of the loaded nodes did not converge in {BOUNDARY_ITERATIONS} conjugate gradient iterations")

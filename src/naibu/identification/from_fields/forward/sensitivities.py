@@ -20,6 +20,7 @@ import scipy.sparse as sp
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
+from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.forward.field_laws import FieldElements, FieldLaw, LawName, computed_mesh, field_law
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, loaded_from_rest
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones, is_surface_sought
@@ -28,15 +29,19 @@ from naibu.identification.from_fields.forward.loaded_components import (
     BLOCK,
     BOUNDARY_TOLERANCE,
     REFRESHED,
+    WORTH,
     BoundaryPreconditioner,
     KeptPreconditioners,
     Solved,
     alike,
     conjugate_gradients,
+    local_preconditioner,
 )
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
+FIRST_TOLERANCE = 1e-4  # of the motion of the surface with which a search at finite strain begins
+TOLD = 10  # products of a linearisation from one report to the next: of thousands of cells and many columns, some seconds
 Gradient = tuple[FloatArray, list[FloatArray]]  # with respect to theta, and to the sought displacements of every load case
 
 
@@ -92,8 +97,9 @@ class FieldModel:
         zones: Zones,
         law: LawName = "linear",
         elements: FieldElements = "accurate",
+        progress: Progress | None = None,
     ) -> None:
-        self.mesh, self.zones = mesh, zones
+        self.mesh, self.zones, self.progress = mesh, zones, progress
         self.computed, self.averaged = computed_mesh(mesh, elements)
         self.law: FieldLaw = field_law(self.computed, law, averaged=self.averaged)
         self.observed = tuple(Observed.of(mesh, self.computed, load_case) for load_case in load_cases)
@@ -232,6 +238,7 @@ class Linearised:
     _border: list[sp.csr_matrix] = field(default_factory=list)
     _gradient: Gradient | None = None
     _fresh: bool = False
+    _products: int = 0
 
     def __post_init__(self) -> None:
         self._transposed = [c.T for c in self.columns]
@@ -304,6 +311,7 @@ class Linearised:
 
     def product(self, theta: FloatArray, loaded: Sequence[FloatArray]) -> tuple[FloatArray, list[FloatArray]]:
         """Return the Gauss-Newton Hessian of half the misfit and prior times a vector; parts (2 count, r) and (n_b, r) as in `forward`."""
+        self._tell()
         moved = self.forward(theta, loaded)
         out, at_loaded = self.adjoint([o.information @ u for o, u in zip(self.model.observed, moved, strict=True)])
         return out, [a + o.prior @ b for a, o, b in zip(at_loaded, self.model.observed, loaded, strict=True)]
@@ -311,6 +319,8 @@ class Linearised:
     def preconditioned(self, loaded: Sequence[FloatArray]) -> list[FloatArray]:
         """Return about what the inverse of the Hessian of the loaded components makes of (n_b, r) of every load case."""
         made = [self.boundary(t) for t in range(len(loaded))]
+        if not self._fresh:
+            self.model.boundary.spent += sum(b.shape[1] for b in loaded)
         groups: dict[int, list[int]] = {}
         for t, one in enumerate(made):
             groups.setdefault(id(one.factor), []).append(t)
@@ -337,35 +347,57 @@ class Linearised:
         """Solve with the Hessian of the loaded components: (n_b, r) of every load case, by preconditioned conjugate gradients."""
         return self._loaded_solved(right, BOUNDARY_TOLERANCE).solution
 
-    def _loaded_solved(self, right: Sequence[FloatArray], tolerance: float) -> Solved:
-        def product(loaded: list[FloatArray]) -> list[FloatArray]:
-            moved = self.forward(None, loaded)
-            pulled = [o.information @ u for o, u in zip(self.model.observed, moved, strict=True)]
-            return [a + o.prior @ b for a, o, b in zip(self.adjoint(pulled)[1], self.model.observed, loaded, strict=True)]
-
-        kept, columns = self.model.boundary, sum(b.shape[1] for b in right)
-        most = sum(len(o.unknown) for o in self.model.observed)
-        if not self._fresh and (columns * AT_ONCE > most or kept.spent > most):
-            kept.forget()
+    def loaded_solved_once(self, right: Sequence[FloatArray]) -> list[FloatArray]:
+        """Solve as `loaded_solved`, roughly, for a few columns at a point at which nothing else is solved."""
+        if all(len(o.unknown) <= REFRESHED for o in self.model.observed):
+            return self.loaded_solved(right)
         try:
-            found = conjugate_gradients(product, self.preconditioned, list(right), tolerance)
-        except ConvergenceError:  # the preconditioner is that of other moduli, too far from these
-            kept.forget()
-            found = conjugate_gradients(product, self.preconditioned, list(right), tolerance)
-        if not self._fresh:
-            kept.spent += columns * found.iterations
-        return found
+            local = [local_preconditioner(o) for o in self.model.observed]
+            return conjugate_gradients(
+                self._loaded_product, lambda r: [f.solve(b) for f, b in zip(local, r, strict=True)], list(right), FIRST_TOLERANCE
+            ).solution
+        except ConvergenceError:  # measurements far from the surface
+            return self.loaded_solved(right)
 
-    def concentrated(self, basis: FloatArray, tolerance: float = BOUNDARY_TOLERANCE) -> Concentrated:
+    def renew_if_due(self, columns: int) -> None:
+        """Have preconditioners made at this point before systems of so many columns, where others have cost or would cost more."""
+        kept, most = self.model.boundary, sum(len(o.unknown) for o in self.model.observed)
+        if not self._fresh and (columns * AT_ONCE > most or kept.spent > WORTH * most):
+            kept.forget()
+
+    def _tell(self) -> None:
+        self._products += 1
+        if self._products % TOLD == 0:
+            report_progress(self.model.progress, "solving for the motion of the surface, iteration", done=self._products)
+
+    def _loaded_product(self, loaded: list[FloatArray]) -> list[FloatArray]:
+        self._tell()
+        moved = self.forward(None, loaded)
+        pulled = [o.information @ u for o, u in zip(self.model.observed, moved, strict=True)]
+        return [a + o.prior @ b for a, o, b in zip(self.adjoint(pulled)[1], self.model.observed, loaded, strict=True)]
+
+    def _loaded_solved(self, right: Sequence[FloatArray], tolerance: float, near: Sequence[FloatArray] | None = None) -> Solved:
+        self.renew_if_due(sum(b.shape[1] for b in right))
+        try:
+            return conjugate_gradients(self._loaded_product, self.preconditioned, list(right), tolerance, near)
+        except ConvergenceError:  # the preconditioner is that of other moduli, too far from these
+            self.model.boundary.forget()
+            return conjugate_gradients(self._loaded_product, self.preconditioned, list(right), tolerance)
+
+    def concentrated(
+        self, basis: FloatArray, tolerance: float = BOUNDARY_TOLERANCE, near: Sequence[FloatArray] | None = None
+    ) -> Concentrated:
         """Return half the misfit as a quadratic in changes of theta along `basis` (2 count, k), minimised over the loaded components.
 
-        Hessian and gradient err by the square of what `tolerance`, a relative residual, leaves of the loaded components.
+        Hessian and gradient err by the square of what `tolerance`, a relative residual, leaves of the loaded components. `near` (n_b, k)
+        is how these respond at a point near by.
         """
         moved = self.forward(basis, None)
         pulls = [o.information @ u for o, u in zip(self.model.observed, moved, strict=True)]
         theta, loaded = self.gradient()
         cross = self.adjoint(pulls)[1]
-        solved = self._loaded_solved([np.column_stack([c, g]) for c, g in zip(cross, loaded, strict=True)], tolerance)
+        begin = None if near is None else [np.column_stack([x, np.zeros(len(x))]) for x in near]
+        solved = self._loaded_solved([np.column_stack([c, g]) for c, g in zip(cross, loaded, strict=True)], tolerance, begin)
         response, offset = [x[:, :-1] for x in solved.solution], [x[:, -1] for x in solved.solution]
         # with the inverse A^-1 and the residual R = C - A X of a solution X: C' A^-1 C = C' X + X' R + R' A^-1 R
         left = [r[:, :-1] for r in solved.residual]

@@ -138,25 +138,29 @@ class Step:
         By how much it should lower the objective.
     standard_deviations : float
         By how many of their own, together, it moves the moduli; infinite where that is not known.
+    response : list of ndarray, shape (n_b, 2 count), or None
+        By how much the loaded components follow each modulus, with a minus sign, mm; None where that was not found.
     """
 
     theta: FloatArray
     loaded: list[FloatArray]
     promise: float
     standard_deviations: float = np.inf
+    response: list[FloatArray] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """End of a search: where, the objective there, how it ended, and after how many iterations."""
+    """End of a search: where, the objective there, how it ended, after how many iterations, and the response of `Step` near by."""
 
     point: Point
     objective: float
     status: Status
     iterations: int
+    response: list[FloatArray] | None = None
 
 
-StepRule = Callable[[Linearised, Objective], Step]
+StepRule = Callable[[Linearised, Objective, list[FloatArray] | None], Step]
 
 
 def first_point(model: FieldModel, theta: FloatArray) -> Point:
@@ -169,23 +173,26 @@ def first_point(model: FieldModel, theta: FloatArray) -> Point:
     """
     small = model if model.law.linear else model.with_law("linear")
     at = small.linearised(small.evaluate(theta, [np.zeros_like(model.points)] * len(model.observed)))
-    step = at.loaded_solved([-g[:, None] for g in at.gradient()[1]])
+    right = [-g[:, None] for g in at.gradient()[1]]
+    step = at.loaded_solved(right) if small is model else at.loaded_solved_once(right)
     moved = at.forward(None, step)
     states = [u + du.reshape(u.shape) for u, du in zip(at.point.states, moved, strict=True)]
-    if small is not model:  # what preconditions small strain does so at finite strain, and took longer to make than all else here
-        model.boundary.take(small.boundary)
     if model.law.linear:
         return model.evaluate(theta, states)
     try:
-        return model.evaluate(theta, model.from_rest(theta, states))
+        point = model.evaluate(theta, model.from_rest(theta, states))
     except ConvergenceError as error:
         raise ConvergenceError(f"{CANNOT_FOLLOW} ({str(error).partition('. ')[0]})") from error
+    at = model.linearised(point)
+    for t in range(len(model.observed)):
+        at.boundary(t)  # after which it is known how many loaded components the measurements determine
+    return point
 
 
-def exact_step(at: Linearised, objective: Objective) -> Step:
-    """Return the Gauss-Newton step from the explicit Hessian of all moduli, the loaded components eliminated."""
+def exact_step(at: Linearised, objective: Objective, near: list[FloatArray] | None = None) -> Step:
+    """Return the Gauss-Newton step from the explicit Hessian of all moduli, the loaded components eliminated; `near` is a response."""
     theta = at.point.theta
-    data = at.concentrated(np.eye(len(theta)), ROUGH_TOLERANCE)
+    data = at.concentrated(np.eye(len(theta)), ROUGH_TOLERANCE, near)
     hessian = data.hessian + objective.curvature(theta).toarray()
     hessian[np.diag_indices_from(hessian)] += ANCHOR * float(np.diag(hessian).max())
     gradient = data.gradient + objective.slope(theta)
@@ -198,7 +205,7 @@ def exact_step(at: Linearised, objective: Objective) -> Step:
     step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
     promise = -float(gradient @ step + 0.5 * step @ hessian @ step)
     loaded = 0.5 * sum(float(r @ p) for r, p in zip(data.offset, at.gradient()[1], strict=True))
-    return Step(step, data.loaded(step), promise + loaded, float(np.sqrt(max(step @ hessian @ step, 0.0))))
+    return Step(step, data.loaded(step), promise + loaded, float(np.sqrt(max(step @ hessian @ step, 0.0))), data.response)
 
 
 def search(
@@ -208,6 +215,7 @@ def search(
     settings: SearchSettings | None = None,
     *,
     rule: StepRule = exact_step,
+    near: list[FloatArray] | None = None,
     progress: Progress | None = None,
 ) -> Found:
     """Lower the objective from a start until steps promise little.
@@ -225,6 +233,8 @@ def search(
     rule : callable
         Finds a step at a linearisation: `exact_step`, or for many zones
         `naibu.identification.from_fields.inversion.truncated_newton.truncated_step`.
+    near : list of ndarray, shape (n_b, 2 count), optional
+        By how much the loaded components follow each modulus at a point near the start, as `Step.response`.
     progress : callable, optional
         Gets a report before every iteration, which takes up to half a minute of thousands of cells.
     """
@@ -233,14 +243,15 @@ def search(
     for iteration in range(chosen.max_iterations):
         report_progress(progress, SEARCHING, done=iteration + 1, objective=value)
         at = model.linearised(point)
-        step = rule(at, objective)
+        step = rule(at, objective, near)
+        near = step.response
         if chosen.ended(step, value):
-            return Found(point, value, Status.CONVERGED, iteration)
+            return Found(point, value, Status.CONVERGED, iteration, near)
         found = _line_search(at, step, objective, value)
         if found is None:
-            return Found(model.evaluate(point.theta, point.states), value, Status.CONVERGED, iteration)
+            return Found(model.evaluate(point.theta, point.states), value, Status.CONVERGED, iteration, near)
         point, value = found
-    return Found(point, value, Status.ITERATION_LIMIT, chosen.max_iterations)
+    return Found(point, value, Status.ITERATION_LIMIT, chosen.max_iterations, near)
 
 
 def _line_search(at: Linearised, step: Step, objective: Objective, value: float) -> tuple[Point, float] | None:

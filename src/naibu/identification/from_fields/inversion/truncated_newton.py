@@ -22,8 +22,15 @@ MAX_ITERATIONS = 150
 DATA_FRACTION = 0.1  # of the mean diagonal of the data's Hessian in the preconditioner: most of its eigenvalues are far below
 
 
-def truncated_step(at: Linearised, objective: Objective, *, forcing: float = FORCING, max_iterations: int = MAX_ITERATIONS) -> Step:
-    """Return an inexact Gauss-Newton step of all moduli and loaded components."""
+def truncated_step(
+    at: Linearised,
+    objective: Objective,
+    near: list[FloatArray] | None = None,
+    *,
+    forcing: float = FORCING,
+    max_iterations: int = MAX_ITERATIONS,
+) -> Step:
+    """Return an inexact Gauss-Newton step of all moduli and loaded components, with no use for a response `near`."""
     theta = at.point.theta
     of_moduli, of_loaded = at.gradient()
     gradient = [of_moduli + objective.slope(theta), *of_loaded]
@@ -53,6 +60,7 @@ class RegularizedSystem:
     """
 
     def __init__(self, at: Linearised, curvature: sp.csr_matrix, free: BoolArray | None = None) -> None:
+        at.renew_if_due(1)
         self.at, self.curvature = at, curvature
         self.free = np.ones(curvature.shape[0], dtype=bool) if free is None else free
         matrix = sp.bsr_matrix(curvature + sp.diags(DATA_FRACTION * self._data_diagonal()), blocksize=(1, 1))

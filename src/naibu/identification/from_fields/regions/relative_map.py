@@ -33,17 +33,12 @@ from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.inversion.regularization import cell_volumes, inner_faces
 from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.uncertainty import Uncertainty, intervals, young_and_poisson_slopes
-from naibu.identification.from_fields.verdict import told_points
+from naibu.identification.from_fields.verdict import FEW_POINTS, told_points
 from naibu.identification.from_fields.verdict_within_cells import with_limits
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 ONE_MATERIAL = (
     "One material explains the measurement: no difference of stiffness can be told from its noise, which does not mean that there is none."
-)
-
-FEW_POINTS = (
-    "There are fewer points than elements: they leave the motion of the surface to the assumption that it is smooth, which draws Poisson's "
-    "ratio towards 0.5. Nothing is said of Poisson's ratio; use larger elements to know more."
 )
 
 

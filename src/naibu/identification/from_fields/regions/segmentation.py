@@ -24,7 +24,7 @@ from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Point
-from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, first_point, search
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Found, Objective, SearchSettings, first_point, search
 from naibu.identification.from_fields.inversion.regularization import BULK_WEIGHT, ZoneGraph
 
 CLUSTERS = (20, 8)  # to begin with, one after the other: the better end counts
@@ -349,16 +349,19 @@ def _from_clusters(
     labels = clusters(graph, start.theta, most)
     volume = np.bincount(labels, graph.volume)
     theta = np.concatenate([np.bincount(labels, graph.volume * t) / volume for t in start.theta.reshape(2, -1)])
-    point, moved = _at(model.with_zones(joined(model.zones, labels)), theta, start), 0
+    point, moved, near = _at(model.with_zones(joined(model.zones, labels)), theta, start), 0, None
     for _ in range(ROUNDS):
         fitted = model.with_zones(joined(model.zones, labels))
-        quadratic = _scaled(fitted.linearised(point).concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE), criterion.scale)
-        united, theta = merged(quadratic, point.theta, areas_between(graph, labels), criterion.weight, criterion.charge)
+        quadratic = fitted.linearised(point).concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE, near)
+        scaled = _scaled(quadratic, criterion.scale)
+        united, theta = merged(scaled, point.theta, areas_between(graph, labels), criterion.weight, criterion.charge)
         before, labels = int(labels.max()), united[labels]
-        labels, point = _refitted(model, labels, theta, point, bounds, progress)
-        changed = 0
+        gather = np.kron(np.eye(2), np.eye(int(united.max()) + 1)[united])
+        labels, found = _refitted(model, labels, theta, point, bounds, progress, [x @ gather for x in quadratic.response])
+        point, near, changed = found.point, found.response, 0
         if graph.count <= EXPLICIT and int(labels.max()) > 0:
             labels, point, changed = _with_better_borders(model, criterion, labels, point, bounds, progress)
+            near = None if changed else near
         moved += changed
         if not changed and before == int(labels.max()):
             break
@@ -382,14 +385,22 @@ def _scaled(quadratic: Concentrated, scale: float) -> Concentrated:
 
 
 def _refitted(
-    model: FieldModel, labels: IntArray, theta: FloatArray, near: Point, bounds: Bounds, progress: Progress | None
-) -> tuple[IntArray, Point]:
+    model: FieldModel,
+    labels: IntArray,
+    theta: FloatArray,
+    near: Point,
+    bounds: Bounds,
+    progress: Progress | None,
+    response: list[FloatArray] | None = None,
+) -> tuple[IntArray, Found]:
     """Fit the moduli of regions to the measurements alone; regions that have no zone any more are left out."""
     kept, labels = np.unique(labels, return_inverse=True)
+    of_kept = np.concatenate([kept, kept + len(theta) // 2])
+    response = None if response is None else [x[:, of_kept] for x in response]
     regions = model.with_zones(joined(model.zones, labels))
     objective = Objective(bounds=bounds)
     start = _at(regions, objective.clipped(theta.reshape(2, -1)[:, kept].ravel()), near)
-    return labels.astype(np.int64), search(regions, start, objective, ROUGHLY, progress=progress).point
+    return labels.astype(np.int64), search(regions, start, objective, ROUGHLY, near=response, progress=progress)
 
 
 def _with_better_borders(
@@ -400,5 +411,5 @@ def _with_better_borders(
     found, moves = border_moves(criterion.graph, labels, point.theta, quadratic, criterion.weight)
     if not moves:
         return labels, point, 0
-    labels, point = _refitted(model, found, point.theta, point, bounds, progress)
-    return labels, point, moves
+    labels, refitted = _refitted(model, found, point.theta, point, bounds, progress)
+    return labels, refitted.point, moves
