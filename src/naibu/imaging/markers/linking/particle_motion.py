@@ -129,8 +129,8 @@ def _kriged(at: FloatArray, moved: FloatArray, trusted: BoolArray, neighbours: I
     """Predict every displacement from those of its neighbours, and its gradient also from its own.
 
     Returns the difference (k, d) of each displacement from its prediction, scaled to the standard deviation of a displacement, the
-    gradients (k, d, d), and the variance (k, d) of their columns for displacements of unit variance. The scale counts only what the noise of
-    the neighbours carries into a prediction: the motion is often less rough, along some axis, than the process takes it for.
+    gradients (k, d, d), and the variance (k, d) of their columns for displacements of unit variance. The scale counts only what the noise
+    of the neighbours carries into a prediction: the motion is often less rough, along some axis, than the process takes it for.
     """
     d, everyone, scale = at.shape[1], np.arange(len(at)), local_spacing(at)
     values, white, noise = moved, np.eye(d), np.ones(len(at))
