@@ -225,6 +225,9 @@ def test_tiff_stacks_of_other_programs(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"does not state its voxel spacing; give spacing_mm, for example \(0"):
         read_volume(tmp_path / "bare.tif")
     tifffile.imwrite(tmp_path / "plane.tif", values, imagej=True, resolution=(2.0, 4.0), metadata={"unit": "mm", "axes": "ZYX"})
+    tifffile.imwrite(tmp_path / "channels.tif", values, imagej=True)
+    with pytest.raises(InputError, match=r"axes CYX.*metadata=\{'axes': 'ZYX'\}"):
+        read_volume(tmp_path / "channels.tif")
     with pytest.raises(InputError, match=r"states no voxel spacing along z \(along x, y: 0\.5, 0\.25 mm\); give spacing_mm"):
         read_volume(tmp_path / "plane.tif")
     np.testing.assert_array_equal(read_volume(tmp_path / "bare.tif", spacing_mm=(1, 1, 2)).values, values)

@@ -115,7 +115,10 @@ def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
     if n_series > 1:
         raise InputError(f"{path.name}: contains {n_series} images of different size or type; save one stack as a file of its own")
     if any(axis in axes and values.shape[axes.index(axis)] > 1 for axis in "TCS"):
-        raise InputError(f"{path.name}: contains several time points or channels (axes {axes}, {values.shape}); save one as a stack")
+        raise InputError(
+            f"{path.name}: contains several time points or channels (axes {axes}, {values.shape}); save one as a stack; slices "
+            "that tifffile wrote as channels get metadata={'axes': 'ZYX'}"
+        )
     return values, stated
 
 
