@@ -222,8 +222,14 @@ def test_tiff_stacks_of_other_programs(tmp_path: Path) -> None:
     np.testing.assert_array_equal(volume.values, values)
     np.testing.assert_allclose(volume.spacing_mm, [5.0, 2.5, 5.0])
     tifffile.imwrite(tmp_path / "bare.tif", values, photometric="minisblack")
-    with pytest.raises(InputError, match="give spacing_mm"):
+    with pytest.raises(InputError, match=r"does not state its voxel spacing; give spacing_mm, for example \(0"):
         read_volume(tmp_path / "bare.tif")
+    tifffile.imwrite(tmp_path / "plane.tif", values, imagej=True, resolution=(2.0, 4.0), metadata={"unit": "mm", "axes": "ZYX"})
+    tifffile.imwrite(tmp_path / "channels.tif", values, imagej=True)
+    with pytest.raises(InputError, match=r"axes CYX.*metadata=\{'axes': 'ZYX'\}"):
+        read_volume(tmp_path / "channels.tif")
+    with pytest.raises(InputError, match=r"states no voxel spacing along z \(along x, y: 0\.5, 0\.25 mm\); give spacing_mm"):
+        read_volume(tmp_path / "plane.tif")
     np.testing.assert_array_equal(read_volume(tmp_path / "bare.tif", spacing_mm=(1, 1, 2)).values, values)
     folder = tmp_path / "slices"
     folder.mkdir()
@@ -309,10 +315,14 @@ def test_dicom_series_that_make_no_volume_are_refused_by_name(tmp_path: Path) ->
         read_volume(tmp_path / "gap")
     write_series(tmp_path / "two", volume, series="1.1")
     write_series(tmp_path / "two", volume, series="1.2")
-    with pytest.raises(InputError, match="contains 2 series"):
+    with pytest.raises(InputError, match=r"2 series.*1\.1.*IM\d+_1\.1 .*; give a file of the one that is meant.*series="):
         read_volume(tmp_path / "two")
     same(read_volume(tmp_path / "two", series="1.2"), volume, geometry=1e-5)
+    same(read_volume(tmp_path / "two" / "IM0000_1.1"), volume, geometry=1e-5)
     same(read_volume(tmp_path / "two", series="series 1.1"), volume, geometry=1e-5)
+    write_series(tmp_path / "uneven", volume, skip=(1, 3))  # slices 0, 2, 4, 5
+    with pytest.raises(InputError, match=r"slice spacing is uneven, 2\.000 to 4\.000 mm \(.*\)"):
+        read_volume(tmp_path / "uneven")
     write_series(tmp_path / "again", volume)
     dicom_slice(volume.values[2], volume.to_physical([0, 0, 2])).save_as(tmp_path / "again" / "x", enforce_file_format=True)
     with pytest.raises(InputError, match="same position"):

@@ -28,6 +28,7 @@ SAID = {
     ],
     "track": [
         ("mask is empty", "--mask is empty"),
+        ("give spacing_mm, for example (0.8, 0.8, 2.0)", "give --spacing-mm, for example 0.8 0.8 2.0"),
         ("the mask is empty", "the mask is empty"),
         ("stated_mm gives no height", "--stated-mm gives no height"),
         ("scans must be at least two", "SCANS must be at least two"),

@@ -128,3 +128,19 @@ def test_jumps_between_slices_are_found() -> None:
     mask[5:7] = False
     assert mask_jumps(mask).tolist() == [5, 7]
     assert not len(mask_jumps(np.zeros_like(mask)))
+
+
+@pytest.mark.parametrize("slice_mm", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("phase", [0.1, 0.5, 0.9])
+def test_the_rounded_ends_of_an_object_in_thick_slices_are_no_jumps(slice_mm: float, phase: float) -> None:
+    z, y, x = np.meshgrid((np.arange(50) + phase) * slice_mm - 75.0, *2 * [np.arange(-25.0, 25.0)], indexing="ij", sparse=True)
+    ball = (x / 22.0) ** 2 + (y / 20.0) ** 2 + ((z - 25.0 * slice_mm + 75.0) / 18.0) ** 2 < 1.0
+    assert ball.any()
+    assert not len(mask_jumps(ball))
+    cut = ball.copy()
+    middle = int(np.argmax(ball.sum(axis=(1, 2))))
+    cut[middle, :, :25] = False
+    assert mask_jumps(cut).tolist() == [middle, middle + 1]
+    torn = ball.copy()
+    torn[::2, :, :20] = False
+    assert len(mask_jumps(torn)) > 4 * len(mask_jumps(ball))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
+from naibu.identification.prediction.predictive_uncertainty import PredictiveUncertainty
 from naibu.workflows.results.report_content import parameter_label, parameter_rows, search_sentence, undetermined
 
 
@@ -59,6 +62,16 @@ def test_what_is_said_of_a_parameter_agrees_with_its_interval(parameter: Paramet
     assert ("".join(said).find(told) >= 0) and bool(said) == bool(told), said
     low, high = model.interval(parameter.name)
     assert low <= parameter.value <= high
+
+
+def test_a_modulus_that_hangs_on_the_law_is_told_with_the_interval_that_does_not() -> None:
+    names = (MODULUS.name, "gel: c20_ratio")
+    for doubtful, told in ((0.3, True), (0.11, False)):
+        model = replace(model_of(MODULUS, 0.08), predictive=PredictiveUncertainty(names, np.diag([doubtful**2, 0.1]), 0.1, 1.0, {}))
+        said = "".join(undetermined(model, [MODULUS.name]))
+        assert bool(said) == told, said
+        if told:
+            assert "law (neo_hookean) is right" in said and "7 to 22.7 kPa" in said  # 12.6 exp(-+ 1.96 0.3)
 
 
 def test_moduli_are_multiples_where_none_is_known() -> None:

@@ -25,6 +25,7 @@ WIDER = 1.6
 THROAT_VOXELS = 300_000  # about so many coarse voxels show the throats
 # share of a slice, of the larger of two neighbours, in which their masks differ, above which the mask jumps
 JUMP = 0.25
+STEADY, STEADILY = 2, 1.5  # slices to either side that tell how an object tapers, and how much faster than that it may
 AIR = 0.01  # share of the field of view with exactly the intensity of the padding, above which that is the intensity of air
 SURROUNDED = 5  # of six directions along the axes, in which space meets the object that surrounds it but for an opening
 LEAST_AREA = 0.02  # of the largest slice: smaller ones are the tip of an object, where slices differ much
@@ -120,6 +121,9 @@ def mask_in_view(volume: Volume, view: Box, *, margin: int = 0) -> BoolArray:
 def mask_jumps(mask: BoolArray) -> IntArray:
     """Return the slices (n,) whose mask differs from that of the slice before by more than a quarter of the larger of both.
 
+    The sections of a rounded object in thick slices change as much next to its ends, but steadily: the area by which the slices around
+    grow or shrink is no jump.
+
     Parameters
     ----------
     mask : ndarray, shape (nz, ny, nx), bool
@@ -137,7 +141,11 @@ def mask_jumps(mask: BoolArray) -> IntArray:
     inner = mask[filled[0] : filled[-1] + 1]
     larger = np.maximum(inner[1:].sum(axis=(1, 2)), inner[:-1].sum(axis=(1, 2)))
     changed = (inner[1:] != inner[:-1]).sum(axis=(1, 2))
-    jumps = (changed > JUMP * larger) & (larger > LEAST_AREA * area.max())
+    if len(changed) <= STEADY:
+        return np.asarray(filled[0] + 1 + np.flatnonzero(changed > JUMP * larger), dtype=np.int64)
+    grown = np.pad(np.diff(inner.sum(axis=(1, 2))), STEADY, mode="reflect")
+    around = np.delete(np.lib.stride_tricks.sliding_window_view(grown, 2 * STEADY + 1), STEADY, axis=1)
+    jumps = (changed - STEADILY * np.abs(np.median(around, axis=1)) > JUMP * larger) & (larger > LEAST_AREA * area.max())
     return np.asarray(filled[0] + 1 + np.flatnonzero(jumps), dtype=np.int64)
 
 

@@ -64,7 +64,7 @@ def read(path: Path, options: ReadOptions) -> Volume:
     if len(slopes) > 1 and not options.rescaled:
         raise InputError(
             f"{path.name}: its slices have different rescale slopes ({len(slopes)} of them), so their stored values are not comparable; "
-            "pass rescaled=True to apply them"
+            "read the series in Python with rescaled=True, which applies them, and write it with naibu.io.write_volume"
         )
     values = _values(pydicom, path.name, slices)
     if options.rescaled:
@@ -152,13 +152,16 @@ def _one_series(path: Path, slices: list[_Slice], wanted: str | None) -> list[_S
             raise InputError(f"{path.name}: {len(chosen)} series are called {wanted!r}; the folder contains {_listed(slices, series)}")
         return [s for s in slices if s.series == chosen[0]]
     if len(series) > 1:
-        raise InputError(f"{path.name}: contains {len(series)} series, {_listed(slices, series)}; choose one with series=")
+        raise InputError(
+            f"{path.name}: contains {len(series)} series, {_listed(slices, series)}; give a file of the one that is meant in place of the "
+            "folder, or choose it in Python with series="
+        )
     return slices
 
 
 def _listed(slices: list[_Slice], series: dict[str, str]) -> str:
-    counts = {uid: sum(s.series == uid for s in slices) for uid in series}
-    return "; ".join(f"{uid} ({description or 'no description'}, {counts[uid]} slices)" for uid, description in series.items())
+    files = {uid: [s.name for s in slices if s.series == uid] for uid in series}
+    return "; ".join(f"{uid} ({text or 'no description'}, {len(files[uid])} slices, {files[uid][0]} ...)" for uid, text in series.items())
 
 
 def _sorted_stack(source: str, slices: list[_Slice]) -> list[_Slice]:
@@ -196,7 +199,11 @@ def _step(source: str, slices: list[_Slice]) -> FloatArray:
     if abs(along[worst] - usual) > EVEN * usual:
         between = f"between {slices[worst].name} and {slices[worst + 1].name} ({along[worst]:.3f} mm apart, the others {usual:.3f} mm)"
         lost = round(along[worst] / usual) - 1
-        what = f"{lost} slice{'s are' if lost > 1 else ' is'} missing" if lost > 0 else "the slice spacing is uneven"
+        if lost < 1 or np.sum(np.abs(along - usual) > EVEN * usual) > 1:
+            range_ = f"{along.min():.3f} to {along.max():.3f} mm"
+            what, between = "the slice spacing is uneven,", f"{range_} (most of all at {slices[worst].name} and {slices[worst + 1].name})"
+        else:
+            what = f"{lost} slice{'s are' if lost > 1 else ' is'} missing"
         raise InputError(f"{source}: {what} {between}; export the whole series again, or resample it to evenly spaced slices")
     total = slices[-1].position - first.position
     # the mean offset: rounding of single positions averages out

@@ -38,10 +38,7 @@ def read(path: Path, options: ReadOptions) -> Volume:
         return volume_with_axes(path.name, values, (0.0, 0.0, 0.0), np.diag(options.spacing_mm))
     steps = np.asarray(stated["steps"], dtype=float)
     if not np.isfinite(steps).all():
-        raise InputError(
-            f"{path.name}: does not state its voxel spacing (stated along x, y, z: {stated['spacing']}); give spacing_mm, for example "
-            "(0.8, 0.8, 2.0)"
-        )
+        raise no_spacing(path.name, stated)
     return volume_with_axes(path.name, values, stated["origin"], steps, options.unit_mm or 1.0)
 
 
@@ -118,7 +115,10 @@ def _loaded(tifffile: Any, path: Path) -> tuple[AnyArray, dict[str, Any]]:
     if n_series > 1:
         raise InputError(f"{path.name}: contains {n_series} images of different size or type; save one stack as a file of its own")
     if any(axis in axes and values.shape[axes.index(axis)] > 1 for axis in "TCS"):
-        raise InputError(f"{path.name}: contains several time points or channels (axes {axes}, {values.shape}); save one as a stack")
+        raise InputError(
+            f"{path.name}: contains several time points or channels (axes {axes}, {values.shape}); save one as a stack; slices "
+            "that tifffile wrote as channels get metadata={'axes': 'ZYX'}"
+        )
     return values, stated
 
 
@@ -135,6 +135,15 @@ def require_all_strips(source: str, page: Any) -> None:
         raise InputError(
             f"{source}: its size of {page.shape} takes {expected} strips, and it lists {listed}; its header is damaged, copy the file again"
         )
+
+
+def no_spacing(source: str, stated: dict[str, Any]) -> InputError:
+    """Return the error of a stack whose geometry (see `stated_geometry`) lacks the spacing along an axis."""
+    known = {axis: value for axis, value in zip("xyz", stated["spacing"], strict=True) if np.isfinite(value)}
+    lacking = ", ".join(axis for axis in "xyz" if axis not in known)
+    there = f" (along {', '.join(known)}: {', '.join(f'{value:.6g}' for value in known.values())} mm)"
+    what = f"states no voxel spacing along {lacking}{there}" if known else "does not state its voxel spacing"
+    return InputError(f"{source}: {what}; give spacing_mm, for example (0.8, 0.8, 2.0)")
 
 
 def stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.io.files.reading import require_regular
 from naibu.io.image_formats.geometry import no_colours
-from naibu.io.image_formats.tiff import require_all_strips, slices_of_folder, stated_geometry
+from naibu.io.image_formats.tiff import no_spacing, require_all_strips, slices_of_folder, stated_geometry
 
 
 class Slices:
@@ -85,10 +85,7 @@ def open_stack(path: Path, spacing_mm: FloatArray | None = None) -> ChunkedVolum
     else:
         steps, origin = np.asarray(stated["steps"], dtype=float), np.asarray(stated["origin"], dtype=float)
     if not np.isfinite(steps).all():
-        raise InputError(
-            f"{path.name}: does not state its voxel spacing (stated along x, y, z: {stated['spacing']}); give spacing_mm, for example "
-            "(0.8, 0.8, 2.0)"
-        )
+        raise no_spacing(path.name, stated)
     lengths = np.linalg.norm(steps, axis=0)
     values: Any
     if mapped:

@@ -27,6 +27,7 @@ from naibu.viewer.tables import Cell, Table
 
 _ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D mm", "in noise units")
 INCOMPRESSIBLE, NOT_VERY_COMPRESSIBLE = 0.499, 0.3  # Poisson's ratios
+BY_LAW = 1.5  # times its standard deviation: a modulus that is so much less certain if the law is not taken for right
 WEAK = 0.6  # of the width of the prior: an interval as wide as that owes little to the data
 LABELS: Mapping[str, str] = {"young_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
 
@@ -239,7 +240,25 @@ def _undetermined(p: Parameter, model: CalibratedModel, assumed: Parameter | Non
         return f"the data hardly determine it; {factor * p.value:.3g} {unit}".rstrip() + f" was found{before}."
     if p.name.endswith("friction") and high > 4.0 * p.value:
         return f"known only to lie between {low:.2g} and {high:.2g}; where surfaces do not slip, a larger friction looks the same."
-    return ""
+    return _by_law(p, model, sd) if p.name.endswith("young_modulus") and p.scale == "log" else ""
+
+
+def _by_law(p: Parameter, model: CalibratedModel, sd: float) -> str:
+    """What the interval of a modulus takes for right: the curvature of the law above all, which a prediction takes for uncertain."""
+    names = [] if model.predictive is None else list(model.predictive.names)
+    if model.predictive is None or p.name not in names:
+        return ""
+    k = names.index(p.name)
+    doubtful = float(np.sqrt(model.predictive.covariance[k, k]))
+    if doubtful < BY_LAW * sd:
+        return ""
+    (factor, unit), half = model.shown(p), 1.959964 * doubtful
+    low, high = (factor * p.value * float(np.exp(side * half)) for side in (-1.0, 1.0))
+    return (
+        f"its interval holds if the law ({model.settings.law}) is right; with as uncertain a curvature of the law as beforehand it is "
+        f"{low:.3g} to {high:.3g} {unit}".rstrip()
+        + ". 'naibu compare' tells whether another law fits better."
+    )
 
 
 def build_report(

@@ -57,6 +57,31 @@ def test_deviations_follow_the_noise_from_place_to_place() -> None:
         assert (ratio > 0.8).all() and (ratio < 1.35).all(), ratio
 
 
+def bulging(x: np.ndarray) -> np.ndarray:
+    """Displacement (n, 3) in a cube of 20 that is compressed by a fifth, more in the middle, and bulges."""
+    aside, height = x[:, :2] - 10.0, x[:, 2] / 20.0
+    down = -4.0 * height * (1.0 + 0.3 * np.cos(np.pi * aside[:, 0] / 20.0))
+    return np.column_stack([(0.15 * np.sin(np.pi * height) + 0.03)[:, None] * aside + (0.5, -0.3), down])
+
+
+@pytest.mark.parametrize("times", [1.0, 7.0])
+def test_deviations_hold_along_an_axis_that_is_less_rough_or_noisier_than_the_others(times: float) -> None:
+    held, ratio = [], []
+    for seed in (11, 12):
+        rng = np.random.default_rng(seed)
+        x = rng.uniform(0.0, 20.0, (600, 3))
+        sd = 0.005 * 20.0 / 600.0 ** (1.0 / 3.0) * np.array([1.0, 1.0, times]) / np.sqrt(2.0)
+        y = (x + bulging(x) + sd * rng.standard_normal(x.shape))[rng.permutation(len(x))]
+        found = particle_motion(x + sd * rng.standard_normal(x.shape), y)
+        stated, valid = found.field.standard_deviation, found.field.valid
+        assert stated is not None
+        off = (found.field.vectors - bulging(found.field.points))[valid]
+        held.append(np.mean(np.abs(off) < 1.96 * stated[valid], axis=0))
+        ratio.append(np.median(stated[valid], axis=0) / (np.sqrt(2.0) * sd))
+    assert (np.mean(held, axis=0) > 0.92).all(), held
+    assert (np.mean(ratio, axis=0) < 1.45).all(), ratio
+
+
 def test_stated_deviations_are_raised_where_residuals_are_larger() -> None:
     x, y, _ = affine(800, 2, (0.02, 0.02, 0.02))
     honest = np.full(x.shape, 0.02 / np.sqrt(2.0))

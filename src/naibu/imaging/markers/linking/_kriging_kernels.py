@@ -61,6 +61,7 @@ def krige(
     derivatives: bool,
     predicted: FloatArray,
     variance: FloatArray,
+    carried: FloatArray,
     gradient: FloatArray,
     gradient_variance: FloatArray,
 ) -> None:
@@ -84,8 +85,9 @@ def krige(
         Distance, in scales, beyond which that part is not correlated.
     derivatives : bool
         Whether gradients are wanted.
-    predicted, variance : ndarray, shape (n, v), (n,)
-        Filled there with predictions, and the variance of their error, in that of the noise.
+    predicted, variance, carried : ndarray, shape (n, v), (n,), (n,)
+        Filled there with predictions, the variance of their error, in that of the noise, and the part of it that the noise of the
+        neighbours carries into them.
     gradient, gradient_variance : ndarray, shape (n, v, d), (n, d)
         Filled there with the derivatives of the values, per mm, and their variance in that of the noise per mm^2; only with `derivatives`.
     """
@@ -115,6 +117,13 @@ def krige(
             right[i] = AFFINE + roughness[p] * left * left * (35.0 * t * t + 18.0 * t + 3.0) / 3.0
         explained = _forward(matrix, right, part)
         variance[p] = max(AFFINE + roughness[p] - explained, 0.0)
+        carried[p] = 0.0
+        for i in range(c - 1, -1, -1):
+            weight = part[i]
+            for k in range(i + 1, c):
+                weight -= matrix[k, i] * right[k]
+            right[i] = weight / matrix[i, i]
+            carried[p] += right[i] ** 2 * spread[i]
         for b in range(v):
             predicted[p, b] = middle[b] + np.dot(sides[b], part)
         if derivatives:

@@ -39,6 +39,8 @@ class LocalKriging:
         Standard deviation of the difference of an ordinary value from its prediction, along each axis.
     noise_sd : ndarray, shape (n,)
         That of the noise of an ordinary value alone.
+    carried : ndarray, shape (n,)
+        Variance that the noise of the neighbours carries into a prediction, in that of the noise.
     roughness : ndarray, shape (n,)
         Variance of the part of the motion that is not affine, in that of the noise.
     """
@@ -46,12 +48,14 @@ class LocalKriging:
     predicted: FloatArray
     sd: FloatArray
     noise_sd: FloatArray
+    carried: FloatArray
     roughness: FloatArray
 
     def __init__(self, points: FloatArray, scale: FloatArray) -> None:
         n, levels = len(points), len(ROUGHNESS)
         self._points, self._scale = points, scale
         self._all_predicted, self._all_variance = np.zeros((levels, *points.shape)), np.ones((levels, n))
+        self._all_carried, self.carried = np.ones((levels, n)), np.ones(n)
         self._length, self._total = np.zeros((levels, n)), np.ones((levels, n))
         self._level, self._cost = np.ones((levels, n)), np.zeros((levels, n))
         self._best, self.noise_sd = np.zeros(n, dtype=np.int64), np.ones(n)
@@ -77,7 +81,7 @@ class LocalKriging:
         for k, roughness in enumerate(ROUGHNESS):
             _solve(
                 some, self._points, self._scale, neighbours, values, noise, np.full(len(values), roughness), self._all_predicted[k],
-                self._all_variance[k],
+                self._all_variance[k], self._all_carried[k],
             )  # fmt: skip
         self._total[:, some] = noise[some] + self._all_variance[:, some]
         self._length[:, some] = np.linalg.norm(values[some] - self._all_predicted[:, some], axis=2) / np.sqrt(self._total[:, some])
@@ -96,22 +100,24 @@ class LocalKriging:
         best = self._best[wide]
         self.predicted[wide], self.roughness[wide] = self._all_predicted[best, wide], np.array(ROUGHNESS)[best]
         self.sd[wide] = self.noise_sd[wide] * np.sqrt(1.0 + self._all_variance[best, wide])
+        self.carried[wide] = self._all_carried[best, wide]
 
     def roughen(self, some: IntArray, factor: FloatArray, neighbours: IntArray, values: FloatArray, noise: FloatArray) -> None:
         """Predict some points (k,) as if the motion were rougher there, by a factor (k,) of its variance, than around."""
         roughness, variance = self.roughness.copy(), np.empty(len(values))
         roughness[some] *= factor
-        _solve(some, self._points, self._scale, neighbours, values, noise, roughness, self.predicted, variance)
+        _solve(some, self._points, self._scale, neighbours, values, noise, roughness, self.predicted, variance, self.carried)
         self.sd[some] = self.noise_sd[some] * np.sqrt(1.0 + variance[some])
 
 
 def _solve(
     some: IntArray, points: FloatArray, scale: FloatArray, neighbours: IntArray, values: FloatArray, noise: FloatArray,
-    roughness: FloatArray, predicted: FloatArray, variance: FloatArray,
+    roughness: FloatArray, predicted: FloatArray, variance: FloatArray, carried: FloatArray,
 ) -> None:  # fmt: skip
+    slope, slope_variance = np.empty((0, 1, 1)), np.empty((0, 1))
     krige(
-        some, points, scale, neighbours, values, noise, roughness, REACH, False, predicted, variance, np.empty((0, 1, 1)), np.empty((0, 1))
-    )
+        some, points, scale, neighbours, values, noise, roughness, REACH, False, predicted, variance, carried, slope, slope_variance
+    )  # fmt: skip
 
 
 def kriged_gradient(
@@ -123,7 +129,8 @@ def kriged_gradient(
     """
     (n, d), everyone = points.shape, np.arange(len(points))
     gradient, variance = np.empty((n, d, d)), np.empty((n, d))
+    predicted, error, carried = np.empty((n, d)), np.empty(n), np.empty(n)
     krige(
-        everyone, points, scale, neighbours, values, noise, roughness, REACH, True, np.empty((n, d)), np.empty(n), gradient, variance,
+        everyone, points, scale, neighbours, values, noise, roughness, REACH, True, predicted, error, carried, gradient, variance,
     )  # fmt: skip
     return gradient, variance

@@ -129,7 +129,8 @@ def _kriged(at: FloatArray, moved: FloatArray, trusted: BoolArray, neighbours: I
     """Predict every displacement from those of its neighbours, and its gradient also from its own.
 
     Returns the difference (k, d) of each displacement from its prediction, scaled to the standard deviation of a displacement, the
-    gradients (k, d, d), and the variance (k, d) of their columns for displacements of unit variance.
+    gradients (k, d, d), and the variance (k, d) of their columns for displacements of unit variance. The scale counts only what the noise
+    of the neighbours carries into a prediction: the motion is often less rough, along some axis, than the process takes it for.
     """
     d, everyone, scale = at.shape[1], np.arange(len(at)), local_spacing(at)
     values, white, noise = moved, np.eye(d), np.ones(len(at))
@@ -138,11 +139,11 @@ def _kriged(at: FloatArray, moved: FloatArray, trusted: BoolArray, neighbours: I
         process.update(everyone, neighbours, values, trusted, noise)
         off = values - process.predicted
         noise = np.maximum(np.linalg.norm(off, axis=1) / (SUSPECT * np.sqrt(d) * np.maximum(process.sd, least)), 1.0) ** 4
-        scaled = off * (process.noise_sd / process.sd)[:, None]
+        scaled = off / np.sqrt(1.0 + process.carried)[:, None]
         factor = np.linalg.cholesky(np.linalg.inv(_shape(scaled[trusted], at, neighbours)))
         values, white = values @ factor, white @ factor
     process.update(everyone, neighbours, values, trusted, noise)
-    residual = (values - process.predicted) * (process.noise_sd / process.sd)[:, None] @ np.linalg.inv(white)
+    residual = (values - process.predicted) / np.sqrt(1.0 + process.carried)[:, None] @ np.linalg.inv(white)
     own = np.ascontiguousarray(np.column_stack([everyone, neighbours[:, :-1]]))
     gradient, variance = kriged_gradient(at, scale, own, values, noise, process.roughness)
     gradient = np.einsum("ca,ncb->nab", np.linalg.inv(white), gradient)
@@ -157,8 +158,11 @@ def _noise(residual: FloatArray, trusted: BoolArray, neighbours: IntArray, at: F
     d = residual.shape[1]
     shape = _shape(residual[trusted], at, neighbours)
     length = np.sqrt(np.einsum("na,ab,nb->n", residual, np.linalg.inv(shape), residual))
-    ratio = np.median(length[neighbours], axis=1) / MEDIAN[d]
-    return np.asarray(np.maximum(ratio, 0.1)[:, None, None] ** 2 * shape)
+    level = np.maximum(np.median(length[neighbours], axis=1) / MEDIAN[d], 0.1) ** 2
+    # where residuals are larger in some places than in others, most of them are below their root mean square, and so are their medians
+    core = trusted & (length <= CORE * np.median(length[trusted]))
+    level /= min(float(level[core].mean()), 1.0)
+    return np.asarray(level[:, None, None] * shape)
 
 
 def _shape(known: FloatArray, at: FloatArray, neighbours: IntArray) -> FloatArray:
