@@ -81,9 +81,9 @@ def outward_normals(found: VolumeCut, blade: SweptBlade, before: FloatArray | No
 def softer_behind_cuts(assembler: Assembler) -> float:
     """Return by how much, %, a force may be too low that presses a cut body between walls, where it cannot give way sideways.
 
-    A body of thickness L and constrained modulus M then yields by ``L / M`` to a pressure, and the sides of a cut through it by ``1 / k``
-    of their penalty; where facets follow a blade in steps, also as these do not hand over the stress along the blade, which is as large
-    as that across it where the body is nearly incompressible.
+    That is in time steps. A body of thickness L and constrained modulus M then yields by ``L / M`` to a pressure. The sides of a cut
+    through it yield by ``1 / k`` of their penalty, where that is not made up from step to step; where facets follow a blade in steps, also
+    as these do not hand over the stress along the blade, which is as large as that across it where the body is nearly incompressible.
     """
     found = 0.0
     for lips in lips_of(assembler):
@@ -94,7 +94,8 @@ def softer_behind_cuts(assembler: Assembler) -> float:
         facets, across = _facets(lips)
         thickness = float((np.ptp(lips.points, axis=0) / np.maximum(np.abs(across), 1e-300)).min())  # of the box around the body
         stepped = facets > (1.0 + STEPS) * lips.area.sum()
-        yielding = MARGIN / float(lips.stiffness.min()) + stepped * YIELDING * float(lips.edge.max()) / float(shear.min())
+        of_penalty = 0.0 if lips.yields else MARGIN / float(lips.stiffness.min())  # made up from step to step
+        yielding = of_penalty + stepped * YIELDING * float(lips.edge.max()) / float(shear.min())
         found = max(found, float((bulk + 4.0 / 3.0 * shear).max()) * yielding / thickness)
     return 100.0 * found / (1.0 + found)
 
@@ -106,7 +107,7 @@ def caution_of_cuts(assembler: Assembler, force: str) -> str:
         return ""
     return (
         f"Behind the cut {force} may be up to {softer:.0f} % too low where walls keep the body from giving way sideways: it is nearly "
-        "incompressible there, and the sides of the cut yield."
+        "incompressible there, and the steps in which the cut follows the blade yield."
     )
 
 

@@ -258,18 +258,18 @@ def test_a_live_body_cut_and_pressed_carries_the_pressure():
 def test_how_much_too_soft_a_body_between_walls_is_behind_a_cut_is_said(height, tilt, n, ratio):
     """Between walls a nearly incompressible cut block is as stiff as the whole one; what is missing is within what is said, and not far.
 
-    That is with the penalties of live bodies, which yield, in a static solution; otherwise those of static solutions are stiffer.
+    That is with the steps of live bodies, which yield, in a static solution; otherwise those of static solutions are tied.
     """
     law, blade = material("neo_hookean", young_modulus=10.0, poisson_ratio=ratio), plane_blade(height * SIZE, tilt)
     whole = box((SIZE,) * 3, (n, n, n), cell_type="tetra", centred=False)
     plain = Assembler.from_materials(elements(whole, "mean_dilatation"), whole.regions, [law])
     body, _, found = FiniteElementBody.of(whole, plain).cut(FiniteElementBody.of(whole, plain).engine.rest(), blade, SIZE / n)
     places, number = np.unique(found.mesh.points, axis=0, return_inverse=True)
-    joined, lips = Mesh.from_arrays(places, number.ravel()[found.mesh.cells], "tetra"), body.engine.assembler.lips
+    joined = Mesh.from_arrays(places, number.ravel()[found.mesh.cells], "tetra")
     forces = []
     for mesh, assembler in (
         (joined, Assembler.from_materials(elements(joined, "mean_dilatation"), joined.regions, [law])),
-        (found.mesh, replace(body.engine.assembler, lips=replace(lips, stiffest=lips.stiffness))),
+        (found.mesh, replace(body.engine.assembler, ties=None)),
     ):
         top = mesh.points[:, 2] > SIZE - 1e-9
         walls = (mesh.points < 1e-9) | (mesh.points > SIZE - 1e-9) | top[:, None]
@@ -279,13 +279,13 @@ def test_how_much_too_soft_a_body_between_walls_is_behind_a_cut_is_said(height, 
         forces.append(assembler.forces(u)[1][top, 2].sum())
     softer, said = 100.0 * (1.0 - forces[1] / forces[0]), softer_behind_cuts(body.engine.assembler)
     tool = plane_indenter((0.0, 0.0, 2.0 * SIZE), (0.0, 0.0, -1.0))
-    if (
-        ratio > 0.4
-    ):  # of smaller ratios the stresses along the cut and across it differ, and sides that slide relieve shear as they ought to
+    if tilt == 0.0:
+        assert softer < 2.0 and said < 1.0  # of the penalty of static solutions; it is made up in time steps
+    elif ratio > 0.4:  # else stresses along the cut and across it differ, and sides that slide relieve shear as they ought to
         assert 0.5 * said < softer < said
     assert ("too low where walls keep" in body.caution("the plate", tool)) == (said >= 5.0)
     assert body.caution("the pull", None) == body.caution("the plate", tool).replace("the plate", "the pull")
-    assert (said >= 5.0) == (ratio == 0.49 or (ratio == 0.45 and tilt > 0.0))
+    assert (said >= 5.0) == (ratio == 0.49 and tilt > 0.0)
     assert softer_behind_cuts(plain) == 0.0 and FiniteElementBody.of(whole, plain).caution("the plate", tool) == ""
 
 
@@ -315,3 +315,24 @@ def test_the_turning_of_normals_does_not_keep_newtons_method_from_an_equilibrium
     shear = material("neo_hookean", young_modulus=10.0, poisson_ratio=0.499).small_strain_shear_modulus
     assert -whole / SIZE**2 > 4.5 * shear
     assert cut == pytest.approx(whole, rel=0.02)
+
+
+@pytest.mark.parametrize(("ratio", "within"), [(0.3, 0.02), (0.49, 0.01), (0.499, 0.01)])
+def test_between_walls_a_block_cut_level_resists_in_time_steps_as_the_whole_one_does(ratio, within):
+    """Pressures across the cut go on from step to step: penalties of the shear modulus alone let 0.49 be 8 % too soft, 0.499 by half."""
+    law, (joined, _) = material("neo_hookean", young_modulus=10.0, poisson_ratio=ratio), cut_block(0.5 * SIZE)
+    whole = FiniteElementBody.of(joined, Assembler.from_materials(elements(joined, "mean_dilatation"), joined.regions, [law]), step_s=0.02)
+    cut, _, _ = whole.cut(whole.engine.rest(), plane_blade(0.5 * SIZE), SIZE / 4)
+    walls = [
+        plane_indenter(np.where(np.arange(3) == axis, high * SIZE, 0.5 * SIZE), np.where(np.arange(3) == axis, 1.0 - 2.0 * high, 0.0))
+        for axis in range(3)
+        for high in (0, 1)
+    ]
+    still, forces = [IndenterVelocity((0.0, 0.0, 0.0))] * 5, []
+    for body in (whole, cut):
+        with replace(body, engine=replace(body.engine, background=False)).session() as session:
+            session.press(walls)
+            for k in range(30):
+                found = session.step(motions=[*still, IndenterVelocity((0.0, 0.0, -0.25 if k < 10 else 0.0))])
+            forces.append(found.indenters[0, 5, 2])
+    assert forces[0] < -10.0 and forces[1] == pytest.approx(forces[0], rel=within)

@@ -57,7 +57,8 @@ def test_a_whole_cut_parts_the_pieces_by_the_pull(tmp_path: Path) -> None:
 
 
 def test_a_gel_whose_forces_may_be_too_low_behind_the_cut_says_so(tmp_path: Path) -> None:
-    body, path = mesh_file(tmp_path), path_file(tmp_path, -5.0)
+    rows = [f"1,{y},-5,6,{y},25" for y in (-15, 0, 15)]  # oblique: facets follow it in steps
+    body, path = mesh_file(tmp_path), path_file(tmp_path, -5.0, "\n".join(["x1,y1,z1,x2,y2,z2", *rows, ""]))
     cut(body, path, out=tmp_path / "gel", pull_percent=0.0, material=MeshMaterial(poisson_ratio=0.495))
     said = json.loads((tmp_path / "gel" / "cut.json").read_text())["caution"]
     assert said.startswith("Behind the cut a force on the body may be up to") and said in (tmp_path / "gel" / "cut.html").read_text()

@@ -17,16 +17,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
+from naibu.mechanics.contact._cut_lip_kernels import RAMP, TANGENTIAL, add_carried, add_facets, add_friction, add_pressure, gaps_and_normals
 
-RAMP = 2e-4  # of the edge: penetration over which the pressure rises smoothly
-FURTHEST = 2.0  # edges between the nodes of a pair across the normal
 STIFFNESS = 40.0  # Young's moduli (of an incompressible solid) over the edge
+YIELDING = 1.5  # ratio of the penalties wanted and had, from which pressures go on from step to step
 CONFINED = 20.0  # constrained moduli over the edge, at least: between walls a body yields by its thickness over this modulus
 LEAST_ALONG = 1e-3  # of the facets' area around a pair, that it stands for where they overhang
-TANGENTIAL = 0.5  # stiffness of a pair before it slips, of that across the sides
 
 Carriers = tuple[IntArray, IntArray, FloatArray]
 
@@ -64,6 +62,8 @@ class CutLips:
         Coulomb's coefficient; 0 for frictionless sides.
     anchors : ndarray, shape (p, 3), optional
         Positions of the second nodes relative to the first, mm, at which friction would vanish; those at rest by default.
+    overlaps : ndarray, shape (p,), optional
+        Gaps, mm, at which pressure would vanish: those of an augmented Lagrangian :cite:p:`wriggers2006`, over the penalty; 0 by default.
     """
 
     points: FloatArray
@@ -78,6 +78,7 @@ class CutLips:
     normals: FloatArray | None = None
     friction: float = 0.0
     anchors: FloatArray | None = None
+    overlaps: FloatArray | None = None
 
     def with_friction(self, coefficient: float) -> CutLips:
         """Return the same pairs with a coefficient of friction.
@@ -99,12 +100,25 @@ class CutLips:
         """Return the same pairs with other anchors (p, 3), mm; None for those at rest."""
         return replace(self, anchors=anchors)
 
+    def with_overlaps(self, overlaps: FloatArray | None) -> CutLips:
+        """Return the same pairs whose pressure vanishes at other gaps (p,), mm; None for 0."""
+        return replace(self, overlaps=overlaps)
+
+    @property
+    def yields(self) -> bool:
+        """Whether the penalty alone would let the sides yield to the pressures in a nearly incompressible body between walls."""
+        return bool((self.stiffest > YIELDING * self.stiffness).any())
+
+    def overlaps_behind(self, displacement: FloatArray) -> FloatArray:
+        """Return the overlaps (p,), mm, of the next step: they exert without a gap what is exerted at a displacement (n, 3)."""
+        return np.asarray(np.maximum(-self.gaps(displacement), 0.0))
+
     def anchors_behind(self, displacement: FloatArray) -> FloatArray:
         """Return the anchors (p, 3), mm, from which the next step goes on: elastic slip is that of the friction at a displacement (n, 3).
 
         Pairs that are open forget where they were.
         """
-        gap, normal = self._gaps_and_normals(displacement)
+        gap, normal = self.gaps_and_normals(displacement)
         d = self._relative(displacement)
         traction = np.zeros_like(d)
         blocks, force = np.zeros((len(d), 3, 3)), np.zeros_like(displacement)
@@ -113,7 +127,7 @@ class CutLips:
 
     def slip_forces(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the forces across (p,) and the friction along the sides (p, 3) that every pair exerts on its first node, mN."""
-        gap, normal = self._gaps_and_normals(displacement)
+        gap, normal = self.gaps_and_normals(displacement)
         traction, blocks = np.zeros_like(normal), np.zeros((len(gap), 3, 3))
         self._rubbed(gap, normal, self._relative(displacement), np.zeros_like(displacement), blocks, traction)
         return _across(gap, self.area, self.edge, self.stiffness), traction
@@ -136,22 +150,25 @@ class CutLips:
         assert self.normals is not None
         return replace(
             self, pairs=self.pairs[which], area=self.area[which], edge=self.edge[which], stiffness=self.stiffness[which],
-            stiffest=self.stiffest[which], normals=self.normals[which],
-            anchors=None if self.anchors is None else self.anchors[which],
+            stiffest=self.stiffest[which], normals=self.normals[which], anchors=None if self.anchors is None else self.anchors[which],
+            overlaps=None if self.overlaps is None else self.overlaps[which],
         )  # fmt: skip
 
     def gaps(self, displacement: FloatArray) -> FloatArray:
-        """Return the distances (p,), mm, along the normals: negative where the sides overlap, infinite where they face away."""
-        return self._gaps_and_normals(displacement)[0]
+        """Return the distances (p,), mm, along the normals, less the overlaps that they have been given.
+
+        They are negative where the sides press, infinite where they face away.
+        """
+        return self.gaps_and_normals(displacement)[0]
 
     def add(self, displacement: FloatArray, force: FloatArray, *, secant: bool = False) -> tuple[float, FloatArray]:
         """Add to internal forces (n, 3), mN; return the energy, mN mm, and the stiffness of every pair (p, 3, 3), mN/mm.
 
         With the `secant` of friction, its force over the elastic slip, instead of the derivative, the stiffness is symmetric and positive.
         """
-        gap, normal = self._gaps_and_normals(displacement)
+        gap, normal = self.gaps_and_normals(displacement)
         blocks = np.zeros((len(self.pairs), 3, 3))
-        energy = _pressed(gap, normal, self.pairs, self.area, self.edge, self.stiffness, force, blocks)
+        energy = add_pressure(gap, normal, self.pairs, self.area, self.edge, self.stiffness, force, blocks)
         if self.friction > 0.0:
             energy += self._rubbed(gap, normal, self._relative(displacement), force, blocks, np.zeros_like(normal), secant=secant)
         return float(energy), blocks
@@ -174,7 +191,7 @@ class CutLips:
         tangential = TANGENTIAL * self.stiffness * self.area
         shift = relative - anchors
         return float(
-            _slipped(
+            add_friction(
                 pressing, slope, normal, self.pairs, shift, tangential, self.friction, secant, not secant, force, blocks, traction
             )
         )  # fmt: skip
@@ -183,19 +200,22 @@ class CutLips:
         first, second = self.pairs.T
         return np.asarray((self.points[second] - self.points[first]) + (displacement[second] - displacement[first]))
 
-    def _gaps_and_normals(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def gaps_and_normals(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the gaps (p,), see `gaps`, and the unit normals (p, 3), from the first side to the second."""
+        overlaps = 0.0 if self.overlaps is None else self.overlaps
         if self.normals is None:
-            return self._gaps_and_normals_at(displacement)
-        gap = (self.normals * self._relative(displacement)).sum(axis=1)
+            gap, normal = self._gaps_and_normals_at(displacement)
+            return gap - overlaps, normal
+        gap = (self.normals * self._relative(displacement)).sum(axis=1) - overlaps
         return np.where(self.normals.any(axis=1), gap, np.inf), self.normals
 
     def _gaps_and_normals_at(self, displacement: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return gaps (p,) and unit normals (p, 3), from the first side to the second, of all pairs at a displacement."""
         sides = np.zeros((2, len(self.pairs), 3))
         at = self.points + displacement
-        _add_facets(at, self.faces, self.pairs, self.corner_pair, sides)
-        _add_carried(at, *self.carriers, sides)
-        gap, normal = _state(at, self.pairs, self.edge, sides)
+        add_facets(at, self.faces, self.pairs, self.corner_pair, sides)
+        add_carried(at, *self.carriers, sides)
+        gap, normal = gaps_and_normals(at, self.pairs, self.edge, sides)
         return gap, normal
 
 
@@ -291,160 +311,8 @@ def _carriers(points: FloatArray, cells: IntArray, pairs: IntArray, normal: Floa
     return np.ascontiguousarray(nodes, dtype=np.int64), pair, np.ascontiguousarray(carried)
 
 
-@njit(cache=True, nogil=True)
-def _add_facets(at, faces, pairs, corner_pair, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the vector areas of facets to the outward normals (2, p, 3) of the pairs at their corners."""
-    e, f = np.empty(3), np.empty(3)
-    for t in range(len(faces)):
-        a, b, c = faces[t, 0], faces[t, 1], faces[t, 2]
-        for i in range(3):
-            e[i], f[i] = at[b, i] - at[a, i], at[c, i] - at[a, i]
-        for k in range(3):
-            p = corner_pair[t, k]
-            if p >= 0:
-                side = 0 if faces[t, k] == pairs[p, 0] else 1
-                for i in range(3):
-                    j, m = (i + 1) % 3, (i + 2) % 3
-                    sides[side, p, i] += e[j] * f[m] - e[m] * f[j]
-
-
-@njit(cache=True, nogil=True)
-def _add_carried(at, cells, side_of, carried, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add to the outward normals (2, p, 3) of pairs what cells carry of them; `side_of` has twice the pair, and one more of the second."""
-    for c in range(len(cells)):
-        p, side, o = side_of[c] // 2, side_of[c] % 2, cells[c, 0]
-        for k in range(3):
-            a, b = cells[c, 1 + (k + 1) % 3], cells[c, 1 + (k + 2) % 3]
-            for i in range(3):
-                j, m = (i + 1) % 3, (i + 2) % 3
-                area = (at[a, j] - at[o, j]) * (at[b, m] - at[o, m]) - (at[a, m] - at[o, m]) * (at[b, j] - at[o, j])
-                sides[side, p, i] += carried[c, k] * area
-
-
-@njit(cache=True, nogil=True)
-def _state(at, pairs, edge, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Gaps (p,) and unit normals (p, 3), from the first side to the second, of pairs with outward normals (2, p, 3)."""
-    gap, normal = np.full(len(pairs), np.inf), np.zeros((len(pairs), 3))
-    for p in range(len(pairs)):
-        facing, size = 0.0, 0.0
-        for i in range(3):
-            facing += sides[0, p, i] * sides[1, p, i]
-            normal[p, i] = sides[0, p, i] - sides[1, p, i]
-            size += normal[p, i] ** 2
-        if facing >= 0.0 or size == 0.0:
-            continue
-        size = np.sqrt(size)
-        along, whole = 0.0, 0.0
-        for i in range(3):
-            normal[p, i] /= size
-            d = at[pairs[p, 1], i] - at[pairs[p, 0], i]
-            along += normal[p, i] * d
-            whole += d * d
-        if whole - along * along <= (FURTHEST * edge[p]) ** 2:
-            gap[p] = along
-    return gap, normal
-
-
-@njit(cache=True, nogil=True)
-def _pressed(gap, normal, pairs, area, edge, stiffness, force, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the internal forces of pairs that overlap, and their stiffness; returns the energy."""
-    energy = 0.0
-    for p in range(len(pairs)):
-        g = gap[p]
-        if g >= 0.0:
-            continue
-        k, ramp = stiffness[p] * area[p], RAMP * edge[p]
-        if g > -ramp:
-            pressing, slope = 0.5 * k * g * g / ramp, -k * g / ramp
-            energy -= k * g * g * g / (6.0 * ramp)
-        else:
-            pressing, slope = -k * (g + 0.5 * ramp), k
-            energy += 0.5 * k * (g * g + g * ramp) + k * ramp * ramp / 6.0
-        for i in range(3):
-            force[pairs[p, 0], i] += pressing * normal[p, i]
-            force[pairs[p, 1], i] -= pressing * normal[p, i]
-            for j in range(3):
-                blocks[p, i, j] += slope * normal[p, i] * normal[p, j]
-    return energy
-
-
-@njit(cache=True, nogil=True)
-def pair_forces(relative, anchors, normals, area, edge, stiffness, mu, force, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set the internal forces (p, 3) of pairs on their first nodes and their stiffnesses (p, 3, 3).
-
-    That of friction is its secant along the slip and its growth with the pressure. Without this growth, iterations diverge where many pairs
-    slide whose normals differ, as on the facets of an oblique cut: approach of one side changes the force along the other.
-    It is what `CutLips.add` finds of pairs that have been given normals, from the positions of the second nodes relative to the first
-    (p, 3), mm, without arrays in between: it is called many times in a step.
-    """
-    count = len(relative)
-    gap, pressing, slope, tangential = np.full(count, np.inf), np.zeros(count), np.zeros(count), np.empty(count)
-    own, both, shift = np.empty((count, 2), np.int64), np.zeros((2 * count, 3)), np.empty((count, 3))
-    blocks[:] = 0.0
-    for p in range(count):
-        own[p, 0], own[p, 1] = 2 * p, 2 * p + 1
-        g, faces = 0.0, False
-        for i in range(3):
-            g += normals[p, i] * relative[p, i]
-            faces = faces or normals[p, i] != 0.0
-            shift[p, i] = relative[p, i] - anchors[p, i]
-        k, ramp = stiffness[p] * area[p], RAMP * edge[p]
-        tangential[p] = TANGENTIAL * k
-        if not faces:
-            continue
-        gap[p], closed = g, min(g, 0.0)
-        pressing[p] = 0.5 * k * closed * closed / ramp if closed > -ramp else -k * (closed + 0.5 * ramp)
-        slope[p] = -g / ramp * k if g > -ramp else k
-    _pressed(gap, normals, own, area, edge, stiffness, both, blocks)
-    if mu > 0.0:
-        _slipped(pressing, slope, normals, own, shift, tangential, mu, True, True, both, blocks, np.zeros((count, 3)))
-    for p in range(count):
-        for i in range(3):
-            force[p, i] = both[2 * p, i]
-
-
 def _across(gap: FloatArray, area: FloatArray, edge: FloatArray, stiffness: FloatArray) -> FloatArray:
-    """Return the forces across the sides (p,), mN, of pairs with these gaps: those of `_pressed`."""
+    """Return the forces across the sides (p,), mN, of pairs with these gaps: those of `add_pressure`."""
     k, ramp = stiffness * area, RAMP * edge
     closed = np.minimum(gap, 0.0)
     return np.where(closed > -ramp, 0.5 * k * closed * closed / ramp, -k * (closed + 0.5 * ramp))
-
-
-@njit(cache=True, nogil=True)
-def _slipped(  # type: ignore[no-untyped-def]  # pragma: no cover
-    pressing, slope, normal, pairs, shift, tangential, mu, secant, growing, force, blocks, traction
-):
-    """Add the friction of closed pairs and its stiffness; returns the energy of elastic slip.
-
-    The stiffness is the derivative, or the secant along the slip; with or without the growth of friction with pressure, which is
-    unsymmetric.
-    """
-    energy = 0.0
-    e = np.empty(3)
-    for p in range(len(pairs)):
-        limit = mu * pressing[p]
-        if limit <= 0.0:
-            continue
-        along = 0.0
-        for i in range(3):
-            along += normal[p, i] * shift[p, i]
-        size = 0.0
-        for i in range(3):
-            e[i] = tangential[p] * (shift[p, i] - along * normal[p, i])
-            size += e[i] * e[i]
-        size = np.sqrt(size)
-        slides = size > limit
-        ratio = limit / size if slides else 1.0
-        energy += 0.5 * (ratio * size) ** 2 / tangential[p]
-        for i in range(3):
-            traction[p, i] = ratio * e[i]
-            force[pairs[p, 0], i] -= ratio * e[i]
-            force[pairs[p, 1], i] += ratio * e[i]
-            for j in range(3):
-                held = ratio * tangential[p] * ((1.0 if i == j else 0.0) - normal[p, i] * normal[p, j])
-                if slides and not secant:
-                    held -= ratio * tangential[p] * e[i] * e[j] / size**2
-                if slides and growing:
-                    held -= mu * slope[p] * e[i] * normal[p, j] / size
-                blocks[p, i, j] += held
-    return energy

@@ -8,6 +8,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact.cut_lips import CutLips, cut_lips
+from naibu.mechanics.contact.step_ties import StepTies, step_ties
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_strain.penalties import node_bulk_moduli, node_shear_moduli
 
@@ -22,11 +23,16 @@ class LipAssembler(Assembler):
         Pairs of nodes on both sides.
     secant : bool
         Whether the tangent contains the secant of friction instead of its derivative, and is symmetric then.
+    ties : StepTies, optional
+        Springs between the steps in which their facets follow an oblique blade. They act in static solutions; iterations with tangents of
+        earlier states take twice as long with them.
     """
 
     lips: CutLips | None = None
     secant: bool = False
+    ties: StepTies | None = None
     _pairs: Int32Array = field(default_factory=lambda: np.zeros((0, 2, 2), dtype=np.int32))
+    _tied: Int32Array | None = None
 
     def forces_of_parameter(self, displacement: FloatArray, direction: FloatArray) -> FloatArray:
         """Return the derivative (n, 3) of the internal forces along `direction` (m, 4) in the cells' parameters; lips have none."""
@@ -39,7 +45,8 @@ class LipAssembler(Assembler):
         """
         if self.lips is None:
             return self
-        return replace(self, lips=self.lips.with_normals_of(displacement).with_anchors(lips if self.unsymmetric else None))
+        ties = None if self.ties is None or self._tied is None else self.ties.in_step(self.lips, displacement)
+        return replace(self, lips=self.lips.with_normals_of(displacement).with_anchors(lips if self.unsymmetric else None), ties=ties)
 
     @property
     def unsymmetric(self) -> bool:
@@ -60,12 +67,21 @@ class LipAssembler(Assembler):
             for a in range(2):
                 for b in range(2):
                     np.add.at(blocks, self._pairs[:, a, b], stiffness if a == b else -stiffness)
+        if self.ties is not None and self._tied is not None:
+            more += self.ties.add(self.lips, displacement, force, self._tied, blocks)
         return energy + more, force, smallest
 
 
 def lips_of(assembler: Assembler) -> tuple[CutLips, ...]:
     """Return the sides of the cuts of an assembler; of one that has none, nothing."""
     return (assembler.lips,) if isinstance(assembler, LipAssembler) and assembler.lips is not None else ()
+
+
+def with_overlaps(assembler: Assembler, overlaps: FloatArray | None) -> Assembler:
+    """Return the assembler whose sides of cuts exert no pressure at gaps (p,), mm; None: at none."""
+    if overlaps is None or not isinstance(assembler, LipAssembler) or assembler.lips is None:
+        return assembler
+    return replace(assembler, lips=assembler.lips.with_overlaps(overlaps))
 
 
 def going_on(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
@@ -82,10 +98,16 @@ def with_secant(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
 
 
 def with_unyielding_lips(assembler: Assembler) -> Assembler:
-    """Return the assembler whose sides of cuts have their largest penalties; the same where there is no cut."""
+    """Return the assembler whose sides of cuts have their largest penalties, and ties; the same where there is no cut."""
     if not isinstance(assembler, LipAssembler) or assembler.lips is None:
         return assembler
-    return replace(assembler, lips=assembler.lips.unyielding())
+    stiff = replace(assembler, lips=assembler.lips.unyielding())
+    if stiff.ties is None:
+        return stiff
+    coupled = stiff.with_couplings(stiff.ties.nodes)
+    pattern = coupled.pattern
+    assert isinstance(coupled, LipAssembler)
+    return replace(coupled, _pairs=pattern.positions(assembler.lips.pairs), _tied=pattern.positions(stiff.ties.nodes))
 
 
 def with_friction(assembler: Assembler, coefficient: float) -> Assembler:
@@ -136,4 +158,4 @@ def with_lips(
     lips = lips.with_friction(friction)
     coupled = assembler.with_couplings(lips.pairs)
     known = {f.name: getattr(coupled, f.name) for f in fields(Assembler)}
-    return LipAssembler(**known, lips=lips, _pairs=coupled.pattern.positions(lips.pairs))
+    return LipAssembler(**known, lips=lips, ties=step_ties(lips), _pairs=coupled.pattern.positions(lips.pairs))

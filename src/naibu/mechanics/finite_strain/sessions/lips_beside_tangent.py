@@ -14,7 +14,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.mechanics.contact.cut_lips import CutLips, pair_forces
+from naibu.mechanics.contact._cut_lip_kernels import pair_forces
+from naibu.mechanics.contact.cut_lips import CutLips
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
@@ -50,19 +51,21 @@ class LipsBesideTangent:
     _before: FloatArray = field(init=False)  # internal forces on the first nodes (k, 3), mN
     _begun: FloatArray = field(init=False)  # positions of the second nodes relative to the first (k, 3), mm
     _anchors: FloatArray = field(init=False)
+    _overlaps: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         self._before, self._now = np.zeros((len(self.points), 3)), np.zeros((len(self.points), 3, 3))
         first, second = self.lips.pairs.T
         at_rest = self.lips.points[second] - self.lips.points[first]
         self._anchors = at_rest if self.lips.anchors is None else self.lips.anchors
+        self._overlaps = np.zeros(len(self.points)) if self.lips.overlaps is None else self.lips.overlaps
         self._begun = at_rest + (self.displacement[second] - self.displacement[first])
         self._evaluate(self._begun, self._before)
 
     def _evaluate(self, relative: FloatArray, force: FloatArray) -> None:
         own = self.lips
         assert own.normals is not None
-        pair_forces(relative, self._anchors, own.normals, own.area, own.edge, own.stiffness, own.friction, force, self._now)
+        pair_forces(relative, self._anchors, own.normals, self._overlaps, own.area, own.edge, own.stiffness, own.friction, force, self._now)
 
     def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the change of the forces up to a displacement (n, 3), mm, to `force` (n, 3), mN."""

@@ -126,7 +126,7 @@ class RealTimeSession(TangentSession):
         """Go on from a state; see `DynamicSession.restore`."""
         DynamicSession.restore(self, state)
         self._pressure, self._near, self._gaps, self._trial, self._search = None, (), (), None, None
-        self._slipped = self.reached.lips
+        self._slipped, self._overlaps = self.reached.lips, self.reached.overlaps
 
     @property
     def under_way(self) -> bool:
@@ -210,7 +210,7 @@ class RealTimeSession(TangentSession):
     def _quasi_newton(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, Trial | None]:
         """Return the balance at the end of a step, or None; yields where one may go on later."""
         tangent, start, h = self._current_tangent(), self.reached, self.engine.step
-        self._elements = replace(self._engine._elements, assembler=self.engine.assembler.in_step(start.displacement, start.lips))
+        self._elements = replace(self._engine._elements, assembler=self._assembler().in_step(start.displacement, start.lips))
         inertial = start.displacement + h * start.velocity
         travel = [float(np.linalg.norm(c.stop - c.start)) for c in contacts]
         fastest = h * float(np.sqrt((start.velocity**2).sum(axis=1).max()))
@@ -401,7 +401,7 @@ class RealTimeSession(TangentSession):
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
-        trial, self._slipped = self._trial, self.reached.lips
+        trial, self._slipped, self._overlaps = self._trial, self.reached.lips, self.reached.overlaps
         self.unbalanced = 0.0 if trial is None else trial.unbalanced
         if trial is None:
             return DynamicSession._accepted(self, h, u, contacts, spin)

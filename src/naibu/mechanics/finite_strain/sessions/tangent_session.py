@@ -43,6 +43,7 @@ class TangentSession(DynamicSession):
     _seen: FloatArray | None = field(init=False, default=None)
     _age: int = field(init=False, default=0)
     _slipped: FloatArray | None = field(init=False, default=None)  # anchors of the sides of cuts when the last step began
+    _overlaps: FloatArray | None = field(init=False, default=None)  # and the gaps at which they began to press
     _until: float = field(init=False, default=np.inf)  # processor time at which a step is left to the next call
 
     def keep_tangent(self) -> None:
@@ -58,7 +59,7 @@ class TangentSession(DynamicSession):
             some.add_force(u, np.zeros_like(u))
         touching = tuple(some.touching() for some in near)
         ahead = self._soon_touched(contacts, [some.gap for some in near])
-        self._engine._rest[:] = [self._made(u, touching, self._places, self._held(), ahead, self._slipped)]
+        self._engine._rest[:] = [self._made(u, touching, self._places, self._held(), ahead, self._slipped, self._overlaps)]
 
     def close(self) -> None:
         """End the thread and release the factors."""
@@ -75,7 +76,7 @@ class TangentSession(DynamicSession):
 
     def _soon_touched(self, contacts: Sequence[Contact], gaps: Sequence[FloatArray]) -> IntArray:
         engine = self._engine
-        ahead = nodes_ahead(contacts, gaps, engine.faces.shape[1], engine._extent, engine.assembler, self.reached.displacement)
+        ahead = nodes_ahead(contacts, gaps, engine.faces.shape[1], engine._extent, self._assembler(), self.reached.displacement)
         return np.concatenate([*self.bodies[1:], ahead])
 
     def _current_tangent(self) -> EarlierTangent:
@@ -93,7 +94,7 @@ class TangentSession(DynamicSession):
         """Return the tangent of the body at rest without contacts of indenters."""
         contacts = self._still()
         gaps = [local_positions(c, self.reached.displacement, 0.0)[1] for c in contacts]
-        return self._made(np.zeros_like(self.engine.points), (), (), self._held(), self._soon_touched(contacts, gaps), None)
+        return self._made(np.zeros_like(self.engine.points), (), (), self._held(), self._soon_touched(contacts, gaps), None, None)
 
     def _still(self) -> tuple[Contact, ...]:
         """Contacts of indenters where they are now."""
@@ -110,9 +111,9 @@ class TangentSession(DynamicSession):
             return
         self._seen = u
         if self._engine.background:
-            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped))
+            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped, self._overlaps))
         else:
-            self._keep(self._made(u, self._near, self._places, self._held(), ahead, self._slipped))
+            self._keep(self._made(u, self._near, self._places, self._held(), ahead, self._slipped, self._overlaps))
 
     def _renewed(self) -> Generator[None, None, EarlierTangent]:
         """Return the tangent of the state reached, which the step waits for; the thread makes it where there is no time."""
@@ -122,7 +123,8 @@ class TangentSession(DynamicSession):
             near.add_force(u, np.zeros_like(u))
             gaps.append(np.full(len(contact.nodes), np.inf))
             gaps[-1][near.points] = near.gap
-        make = partial(self._made, u, self._near, self._places, self._held(), self._soon_touched(self._templates, gaps), self._slipped)
+        ahead = self._soon_touched(self._templates, gaps)
+        make = partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped, self._overlaps)
         if not self._engine.background or self._until == np.inf:
             return self._used(self._keep(make()))
         while not self._thread.idle:
@@ -164,12 +166,14 @@ class TangentSession(DynamicSession):
         held: IntArray,
         ahead: IntArray,
         slipped: FloatArray | None,
+        overlaps: FloatArray | None,
     ) -> EarlierTangent:
         """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`.
 
         Of sides of cuts that slide, its secant is that of a step that began with these anchors: at the end of a step they have slipped.
+        Those that press do so as in this step.
         """
-        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead, slipped)
+        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead, slipped, overlaps)
 
     def _release(self, tangent: EarlierTangent | None) -> None:
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
