@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -40,20 +43,22 @@ def porous(n: int, seed: int) -> np.ndarray:
     return kept
 
 
-def specimens() -> dict[str, tuple[Lattice, LatticeParameters]]:
-    mesh = box((30.0, 20.0, 40.0), (6, 4, 8), cell_type="tetra")
-    found = {"tetrahedra": volumetric_lattice(mesh, density=1e-6, young_modulus=300.0)}
-    for name, lattice in (
-        ("classic", classic_lattice(box_mask((9, 8, 10)), 5.0, total_mass_kg=0.3)),
-        ("holes", classic_lattice(porous(10, 1), 5.0, total_mass_kg=0.3)),
-        ("octree", octree_lattice(box_mask((16, 16, 16)), 5.0, 1, total_mass_kg=0.6)),
-        ("bar", classic_lattice(box_mask((40, 4, 5)), 3.0, total_mass_kg=0.05)),
-    ):
-        found[name] = (lattice, lattice_parameters(lattice, *STIFF))
-    return found
+SPECIMENS: dict[str, Callable[[], Lattice]] = {
+    "classic": lambda: classic_lattice(box_mask((9, 8, 10)), 5.0, total_mass_kg=0.3),
+    "holes": lambda: classic_lattice(porous(10, 1), 5.0, total_mass_kg=0.3),
+    "octree": lambda: octree_lattice(box_mask((16, 16, 16)), 5.0, 1, total_mass_kg=0.6),
+    "bar": lambda: classic_lattice(box_mask((40, 4, 5)), 3.0, total_mass_kg=0.05),
+}
+NAMES = ["tetrahedra", *SPECIMENS]
 
 
-SPECIMENS = specimens()
+@cache
+def specimen(name: str) -> tuple[Lattice, LatticeParameters]:
+    if name == "tetrahedra":
+        mesh = box((30.0, 20.0, 40.0), (6, 4, 8), cell_type="tetra")
+        return volumetric_lattice(mesh, density=1e-6, young_modulus=300.0)
+    lattice = SPECIMENS[name]()
+    return lattice, lattice_parameters(lattice, *STIFF)
 
 
 def pushed(engine: LatticeEngine, steps: int = 8):
@@ -75,9 +80,9 @@ def helped(monkeypatch: pytest.MonkeyPatch, between: bool = False) -> None:
 
 
 @pytest.mark.parametrize("between", [False, True])
-@pytest.mark.parametrize("name", SPECIMENS)
+@pytest.mark.parametrize("name", NAMES)
 def test_the_solution_is_the_same_with_fewer_iterations(name, between, monkeypatch):
-    lattice, parameters = SPECIMENS[name]
+    lattice, parameters = specimen(name)
     monkeypatch.setattr(coarse_space, "_FEW", np.inf)
     plain = pushed(LatticeEngine.of(lattice, parameters, tolerance=1e-8))
     helped(monkeypatch, between)
@@ -91,11 +96,11 @@ def test_the_solution_is_the_same_with_fewer_iterations(name, between, monkeypat
 
 
 @pytest.mark.parametrize("between", [False, True])
-@pytest.mark.parametrize("name", SPECIMENS)
+@pytest.mark.parametrize("name", NAMES)
 def test_coarse_functions_reproduce_linear_fields(name, between, monkeypatch):
     """Hat functions add up to any linear field where the nodes are; and what goes down is the transpose of what comes up."""
     helped(monkeypatch, between)
-    lattice, parameters = SPECIMENS[name]
+    lattice, parameters = specimen(name)
     engine = LatticeEngine.of(lattice, parameters)
     steps, vectors, (further, less), _, weights, _ = engine.scratch.coarse
     rng = np.random.default_rng(2)
@@ -139,7 +144,7 @@ def test_coarse_functions_reproduce_linear_fields(name, between, monkeypatch):
 def test_the_coarse_matrix_is_the_lattices_own(name, monkeypatch):
     """c . B c = (P c) . (A + s D) P c at rest, with the matrix A of the step and the share s of its diagonal that is added."""
     helped(monkeypatch)
-    lattice, parameters = SPECIMENS[name]
+    lattice, parameters = specimen(name)
     engine = LatticeEngine.of(lattice, parameters)
     engine.run(engine.rest(), 1)  # stores the directions at rest
     blocks, _ = engine.kernel
@@ -159,7 +164,7 @@ def test_the_coarse_matrix_is_the_lattices_own(name, monkeypatch):
 @pytest.mark.parametrize("name", ["classic", "octree", "tetrahedra"])
 def test_what_contact_adds_to_the_coarse_matrix_is_the_product_of_its_own_with_coarse_functions(name, monkeypatch):
     helped(monkeypatch)
-    lattice, parameters = SPECIMENS[name]
+    lattice, parameters = specimen(name)
     corner, weight = LatticeEngine.of(lattice, parameters).scratch.coarse[4][:2]
     rng, count = np.random.default_rng(4), int(corner.max()) + 1
     touched = rng.choice(lattice.n_nodes, 20, replace=False)
@@ -186,7 +191,7 @@ def test_what_contact_adds_to_the_coarse_matrix_is_the_product_of_its_own_with_c
 @pytest.mark.parametrize(("name", "between", "share"), [("classic", False, 0.52), ("classic", True, 0.5), ("octree", False, 0.5)])
 def test_a_body_on_a_floor_that_a_plate_drags_needs_fewer_iterations(name, between, share, monkeypatch):
     """Contact is all that holds the body: coarse functions that did not know of it would not help. Results are those without them."""
-    lattice = SPECIMENS[name][0]
+    lattice = specimen(name)[0]
     parameters = lattice_parameters(lattice, 40.0, 18.0, 1000.0)
     low, high = lattice.points.min(axis=0), lattice.points.max(axis=0)
     middle, wide = 0.5 * (low + high), 4.0 * float((high - low).max())
@@ -235,7 +240,7 @@ def test_energy_never_grows_with_coarse_functions(seed, monkeypatch):
 
 def test_a_run_does_not_depend_on_those_before_it(monkeypatch):
     helped(monkeypatch)
-    lattice, parameters = SPECIMENS["classic"]
+    lattice, parameters = specimen("classic")
     engine = LatticeEngine.of(lattice, parameters)
     once = pushed(engine)
     engine.run(engine.rest(), 3, ConstrainedNodes.of([5, 9]), [1.0, 2.0, 3.0])
@@ -248,7 +253,7 @@ def test_a_run_does_not_depend_on_those_before_it(monkeypatch):
 def test_a_lattice_that_has_turned_is_solved_as_well(monkeypatch):
     """The coarse matrix is that of the lattice at rest; a lattice that has turned costs iterations, not accuracy."""
     helped(monkeypatch)
-    lattice, parameters = SPECIMENS["classic"]
+    lattice, parameters = specimen("classic")
     engine = LatticeEngine.of(lattice, parameters, tolerance=1e-6)
     z = lattice.points[:, 2]
     constrained = ConstrainedNodes.of(np.flatnonzero(z < 1.0), 0) + ConstrainedNodes.of(np.flatnonzero(z > 49.0), 1)
