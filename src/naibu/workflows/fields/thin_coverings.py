@@ -184,7 +184,7 @@ def loaded_below(mesh: Mesh, covered: BoolArray, grid: Volume) -> BoolArray:
     out[nodes[at <= 0.5 * edge]] = True
     beyond = np.flatnonzero(out[mesh.cells].any(axis=1))
     index = np.round(grid.to_index(_points_within(mesh, beyond).reshape(-1, 3))).astype(np.int64)[:, ::-1]
-    there = ((index >= 0) & (index < covered.shape)).all(axis=1)
+    there: BoolArray = np.asarray(((index >= 0) & (index < covered.shape)).all(axis=1))
     there[there] = covered[tuple(index[there].T)]
     part = there.reshape(len(beyond), -1).mean(axis=1)
     out[mesh.cells[beyond[part > REACHES]]] = True
