@@ -70,6 +70,15 @@ def test_a_thin_skin_is_left_out_and_a_thick_one_is_not() -> None:
             )
 
 
+def test_a_thin_skin_of_known_modulus_is_left_out_unless_it_alone_sets_the_scale() -> None:
+    labels = cylinder()
+    numbers = labels.values.astype(np.int64)
+    for known, out in ((("core", "skin"), ("skin",)), (("skin",), None)):
+        sought = set(NAMES.values()) - set(known)
+        covering = without_thin_coverings(inside(labels), numbers, NAMES, sought, 5.0, exactly=False, most=1000, known=known)[2]
+        assert (None if covering is None else covering.names) == out
+
+
 def test_a_thin_zone_that_does_not_cover_or_is_all_that_is_sought_is_refused() -> None:
     labels = cylinder()
     numbers = labels.values.astype(np.int64)

@@ -87,6 +87,8 @@ class FieldIdentification(ShownInNotebook):
         Cell of the model at every voxel of it; -1 outside.
     covering : Covering or None
         Zones that cover the object, are thinner than cells, and are left out of the model.
+    left_out : tuple of str
+        Those of them whose moduli were sought.
     files : tuple of Path
         What was written.
     """
@@ -99,6 +101,7 @@ class FieldIdentification(ShownInNotebook):
     scan: Volume
     cell_of_voxel: IntArray
     covering: Covering | None = None
+    left_out: tuple[str, ...] = ()
     files: tuple[Path, ...] = ()
 
     @property
@@ -206,9 +209,11 @@ def identify_fields(
     usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else min(CELLS, most)
     size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
     sought = () if each_cell else set(names.values()) - set(stated.values)
-    scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0)
+    if not each_cell:
+        scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0, known=stated.not_rigid)
+    given = stated
     if scanned.covering is not None:
-        sought = set(sought) & set(scanned.names.values())
+        sought, stated = set(sought) & set(scanned.names.values()), stated.without(scanned.covering.names)
         size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
     cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
@@ -222,7 +227,7 @@ def identify_fields(
                 cubes, found, stated, most=min(MOST_REFINED, most), law=law, bounds=bounds, progress=progress
             )
     if scanned.covering is not None:
-        found = told_left_out(found, scanned.covering)
+        found = told_left_out(found, scanned.covering, given.values)
     cases = cubes.load_cases
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
@@ -236,7 +241,10 @@ def identify_fields(
     doubts += tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
     coarse += cubes.noise
     notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
-    result = FieldIdentification(found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel, scanned.covering)
+    result = FieldIdentification(
+        found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel, scanned.covering,
+        () if scanned.covering is None else tuple(name for name in scanned.covering.names if name not in given.values),
+    )  # fmt: skip
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
@@ -301,8 +309,7 @@ def table_of_zones(result: FieldIdentification) -> Table:
         for i, name in enumerate(found.zones.names):
             e, nu = (float(values[i]) for values in (found.young_modulus, found.poisson_ratio))
             rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i]), how[i]))
-    left_out = () if result.covering is None else result.covering.names
-    rows += [(name, *NO_VALUE, NOT_DETERMINED) for name in left_out]
+    rows += [(name, *NO_VALUE, NOT_DETERMINED) for name in result.left_out]
     moduli = (f"Young's modulus, {result.unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
     columns = ("zone", *moduli, "Young's modulus is")
     return Table("Moduli", columns, tuple(rows))

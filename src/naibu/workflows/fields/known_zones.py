@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from naibu.core.errors import InputError
@@ -22,6 +22,16 @@ class KnownZones:
     values: Mapping[str, tuple[float, float]]
     doubts: Mapping[str, tuple[float, float]]
     relative: bool
+
+    @property
+    def not_rigid(self) -> tuple[str, ...]:
+        """Names of the zones that are not called rigid."""
+        return tuple(self.doubts)
+
+    def without(self, names: Collection[str]) -> KnownZones:
+        """Return what is known of other zones than these."""
+        values, doubts = ({k: v for k, v in given.items() if k not in names} for given in (self.values, self.doubts))
+        return KnownZones(values, doubts, self.relative)
 
 
 NOTHING_KNOWN = KnownZones({}, {}, relative=True)

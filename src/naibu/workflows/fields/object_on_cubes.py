@@ -70,10 +70,15 @@ class ScannedObject:
     loaded: tuple[str, ...]
     covering: Covering | None = None
 
-    def without_thin_coverings(self, size_mm: float, sought: Collection[str], *, exactly: bool) -> ScannedObject:
+    def without_thin_coverings(
+        self, size_mm: float, sought: Collection[str], *, exactly: bool, known: Collection[str] = ()
+    ) -> ScannedObject:
         """Return the object without zones that are thinner than cubes of a size (see `naibu.workflows.fields.thin_coverings`)."""
-        most = int(max(int(field.valid.sum()) for _, field in self.fields) / LEAST_POINTS)
-        left, names, covering = without_thin_coverings(self.inside, self.labels, self.names, sought, size_mm, exactly=exactly, most=most)
+        points = max(int(field.valid.sum()) for _, field in self.fields)
+        left, names, covering = without_thin_coverings(
+            self.inside, self.labels, self.names, sought, size_mm, exactly=exactly, known=known,
+            most=min(int(points / LEAST_POINTS), MOST_REFINED),
+        )  # fmt: skip
         return self if covering is None else replace(self, inside=left, names=names, covering=covering)
 
     @property

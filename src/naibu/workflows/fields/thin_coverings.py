@@ -27,12 +27,13 @@ WHOLE = 0.95  # part of what is left that must hang together
 GROWN = 1.0  # edge lengths of cubes by which a grid reaches beyond what is left, so that it has stairs to be moved onto its surface
 SPREAD = 4  # voxels over which a border is spread to measure its area
 REACHES = 0.2  # part of a cell in a covering from which forces at all of its nodes count as unknown
-LEFT_OUT = "the modulus of {} is not determined, because {} thinner than elements and is left out"
+LEFT_OUT = "the modulus of {} is not determined, because {} thinner than elements and left out"
+STATED = "{}, thinner than elements, {} left out"
 TOLD = (
-    "{}, {:.2g} mm thick, covers the object and is thinner than cubes can show. Forces on its outer side are not known, so that its "
-    "modulus cannot be told. It is left out of the model: what it does to what lies below counts as unknown forces, and moduli of other "
-    "zones do not depend on it."
+    "{}, {:.2g} mm thick, covers the object and is thinner than cubes can show. {} It is left out of the model: what it does to what lies "
+    "below counts as unknown forces, and moduli of other zones do not depend on it."
 )
+WHY = "Forces on its outer side are not known, so that its modulus cannot be told."
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +64,7 @@ def without_thin_coverings(
     *,
     exactly: bool,
     most: int,
+    known: Collection[str] = (),
 ) -> tuple[Volume, dict[int, str], Covering | None]:
     """Return what is left of an object without zones that cover it and that cubes cannot show, the names of its labels, and these zones.
 
@@ -71,26 +73,33 @@ def without_thin_coverings(
     inside, labels, names, sought, size_mm, exactly
         See `naibu.workflows.fields.block_mesh.mesh_that_shows`.
     most : int
-        Cells for which there are points enough: a zone that needs more is left out if it covers the object, and has them if it does not.
+        Cells for which there are points and time enough: a zone that needs more is left out if it covers the object, and has them if not.
+    known : collection of str
+        Zones of known modulus that is not that of a rigid body: they are left out as well, but for the last one, which sets the scale.
 
     Raises
     ------
-    InputError
-        A zone that cubes cannot show and that does not cover the object, or no other zone that is sought.
+    ZoneTooThin
+        A zone that is sought, that cubes cannot show and that does not cover the object, or is the only one.
     """
     left, of_left, out = inside, dict(names), Covering((), (), np.zeros(inside.shape, dtype=bool))
-    most = min(most, MOST_BY_DEFAULT)
+    most, stated = min(most, MOST_BY_DEFAULT), set(known)
     while True:
+        wanted = (set(sought) | stated) - set(out.names)
         try:
-            mesh_on_what_is_left(left, labels, of_left, set(sought) - set(out.names), size_mm, out.voxels, exactly=exactly, most=most)
+            mesh_on_what_is_left(left, labels, of_left, wanted, size_mm, out.voxels, exactly=exactly, most=most)
         except ZoneTooThin as error:
             label = next(number for number, name in of_left.items() if name == error.zone)
             voxels = (left.values != 0) & (labels == label)
             rest = (left.values != 0) & ~voxels
-            if not set(sought) - {*out.names, error.zone} or not _covers(left, voxels, rest):
-                if exactly or most == MOST_BY_DEFAULT:
+            others = wanted & (stated if error.zone in stated else set(sought)) - {error.zone}
+            if not others or not _covers(left, voxels, rest):
+                if error.zone in stated:
+                    stated.remove(error.zone)
+                elif exactly or most == MOST_BY_DEFAULT:
                     raise
-                most = MOST_BY_DEFAULT
+                else:
+                    most = MOST_BY_DEFAULT
                 continue
             thickness = _thickness_mm(voxels, rest, left)
             out = Covering((*out.names, error.zone), (*out.thickness_mm, thickness), out.voxels | voxels)
@@ -175,7 +184,7 @@ def loaded_below(mesh: Mesh, covered: BoolArray, grid: Volume) -> BoolArray:
     out[nodes[at <= 0.5 * edge]] = True
     beyond = np.flatnonzero(out[mesh.cells].any(axis=1))
     index = np.round(grid.to_index(_points_within(mesh, beyond).reshape(-1, 3))).astype(np.int64)[:, ::-1]
-    there = ((index >= 0) & (index < covered.shape)).all(axis=1)
+    there: BoolArray = np.asarray(((index >= 0) & (index < covered.shape)).all(axis=1))
     there[there] = covered[tuple(index[there].T)]
     part = there.reshape(len(beyond), -1).mean(axis=1)
     out[mesh.cells[beyond[part > REACHES]]] = True
@@ -213,12 +222,16 @@ def _thickness_mm(voxels: BoolArray, rest: BoolArray, grid: Volume) -> float:
     return float(voxels.sum()) / max(area, 1e-12)
 
 
-def told_left_out(found: FieldEstimate, covering: Covering) -> FieldEstimate:
-    """Return the estimate with the zones that were left out named as not determined, in its verdict first."""
-    both = " and ".join(covering.names)
-    limit = LEFT_OUT.format(both, "they are" if len(covering.names) > 1 else "it is")
-    each = tuple(TOLD.format(name, mm) for name, mm in zip(covering.names, covering.thickness_mm, strict=True))
+def told_left_out(found: FieldEstimate, covering: Covering, known: Collection[str] = ()) -> FieldEstimate:
+    """Return the estimate with the zones that were left out named in its verdict first, as not determined unless they are `known`."""
+    own, stated = (tuple(name for name in covering.names if (name in known) == wanted) for wanted in (False, True))
+    limits = [LEFT_OUT.format(" and ".join(own), "they are" if len(own) > 1 else "it is")] if own else []
+    limits += [STATED.format(" and ".join(stated), "are" if len(stated) > 1 else "is")] if stated else []
+    each = tuple(
+        TOLD.format(name, mm, "" if name in known else WHY).replace("  ", " ")
+        for name, mm in zip(covering.names, covering.thickness_mm, strict=True)
+    )
     if found.verdict is None:
         return replace(found, identifiability=(*found.identifiability, *each))
-    judged = replace(found.verdict, limits="; ".join(filter(None, (limit, found.verdict.limits))))
+    judged = replace(found.verdict, limits="; ".join(filter(None, (*limits, found.verdict.limits))))
     return replace(found, verdict=judged, identifiability=(judged.sentence, *each, *found.identifiability[1:]))
