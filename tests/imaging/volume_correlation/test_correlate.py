@@ -239,7 +239,7 @@ def test_the_covariance_covers_the_truth() -> None:
     e = found.displacement_at(inside) - move(inside)
     covered = np.einsum("ni,ni->n", e, np.linalg.solve(found.covariance_at(inside), e[..., None])[..., 0]) < CHI_SQUARED_95
     assert np.linalg.norm(e, axis=1).mean() < 0.12
-    assert 0.9 <= covered.mean() <= 0.9995
+    assert 0.9 <= covered.mean() <= 0.999
     # and is no wider than it must be: errors are a fair fraction of it
     assert np.sqrt((e**2).sum() / np.einsum("nii->", found.covariance_at(inside))) > 0.3
 

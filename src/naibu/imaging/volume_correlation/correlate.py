@@ -399,12 +399,12 @@ class Correlation:
         penalties = system.bending_load(self.c, self.bending) + system.dilatation_load(self.c, self.dilatation * system.gauss_volume)
         return hidden_dilatation(self.fit, self.c, *tried, noise, some, -penalties, robust)
 
-    def contrasts(self, noise: ResidualNoise, drawn: Float32Array) -> tuple[WeightContrast, ...]:
-        """Return the contrasts of weights, given noise and what `CorrelationFit.noise_samples` draws of it for `hidden`."""
+    def contrasts(self, noise: ResidualNoise, drawn: Float32Array, bias: Float32Array) -> tuple[WeightContrast, ...]:
+        """Return the contrasts of weights, given noise, what `CorrelationFit.noise_samples` drew of it for `hidden`, and the bias."""
         fit, shown = self.fit, Volume.from_array(self.reference, spacing_mm=self.spacing)
         parts = [fit.level.listed(part) for part in intensity_parts(shown, self.mask)]
         penalties = self.bending, self.dilatation * fit.system.gauss_volume
-        return weight_contrasts(fit, self.c, penalties, parts, noise, self.settings.seed + 3, drawn)
+        return weight_contrasts(fit, self.c, penalties, parts, noise, self.settings.seed + 3, drawn, bias)
 
     def result(self) -> CorrelationResult:
         """Draw the covariance, and return the result."""

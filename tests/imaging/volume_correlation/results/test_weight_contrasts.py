@@ -49,7 +49,7 @@ def test_residuals_of_a_translation_move_the_field_by_it_whatever_voxels_weigh(c
     penalties = correlation.bending, correlation.dilatation * system.gauss_volume
     noise, upper = correlation.noise(), fit.level.index[:, 2] > np.median(fit.level.index[:, 2])
     drawn = np.zeros((system.n, 3, 2), np.float32)
-    moved = weight_contrasts(fit, still, penalties, (upper, ~upper), noise, 1, drawn)
+    moved = weight_contrasts(fit, still, penalties, (upper, ~upper), noise, 1, drawn, np.zeros((system.n, 3), np.float32))
     assert [contrast.voxels.mean() for contrast in moved] == pytest.approx([1.0, upper.mean(), 1.0 - upper.mean()])
     for contrast in moved:
         off = at_voxels(correlation, contrast.moved / noise.scale)[contrast.voxels] - shift

@@ -18,6 +18,8 @@ from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.common_content import CommonContent
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.results.cell_errors import (
+    BENDING_BIAS,
+    DILATATION_BIAS,
     REMAINING,
     bias_covariance,
     biases,
@@ -292,13 +294,14 @@ def collected(
     content: CommonContent,
     misfit: FloatArray,
     hidden: tuple[FloatArray, FloatArray],
-    contrasts: Callable[[], Sequence[WeightContrast]] = tuple,
+    contrasts: Callable[[Float32Array], Sequence[WeightContrast]] = lambda _: (),
 ) -> CorrelationResult:
     """Return the result of a fit at full resolution.
 
     `samples` (n, 3, s) are random coefficients about c. Soft cells whose content is not in both volumes are not answered. `misfit` (m, 3)
     is that of `CorrelationFit.cell_misfit` at full resolution, and `hidden` two variances (m,): those of `hidden_dilatation`. `contrasts`
-    gives those of `weight_contrasts`, once the assembled equations are needed no more.
+    gives those of `weight_contrasts`, given what penalising the field once more takes away, when the assembled equations are needed no
+    more.
 
     Notes
     -----
@@ -318,7 +321,7 @@ def collected(
     misplaced = misplacement_variance(fit, misfit, content.unlike)
     sampled = sampled_covariance(fit, samples)
     taken = bias_covariance(fit, bias, sampled)
-    shared, strained = contrast_errors(fit, c, contrasts())
+    shared, strained = contrast_errors(fit, c, contrasts(bias[0] / BENDING_BIAS + bias[1] / DILATATION_BIAS))
     taken += shared
     others = sampled + taken + (remaining + misplaced)[:, None, None] * np.eye(3)
     lost = variance_of_one_line(hidden[0], np.trace(others, axis1=1, axis2=2) / 3.0)

@@ -28,9 +28,10 @@ from naibu.imaging.volume_correlation.results.cell_errors import (
 )
 
 JITTIER = 3.0  # times the sub-voxel jitter, with which edges count less
-# empirical: error of the field, over what it moves by when edges count less: they still count, and the penalties hold the field. In fat of
-# two chests of 3 mm voxels it is about twice that
-OF_EDGES = 1.75
+# empirical: error of the field, over what it moves by when edges count less: they still count, and the penalties hold the field; and the
+# part of what the penalties would then take more that is none: what they take is estimated from a field that has the error, too. Both
+# chosen with two chests, and with a body whose waves the penalties flatten
+OF_EDGES, OF_PENALTIES = 3.0, 0.6
 # empirical: squares of what noise alone moves, as in few independent cells of a window they may be by chance, that are no error
 BY_CHANCE = 1.8
 
@@ -65,6 +66,7 @@ def weight_contrasts(
     noise: ResidualNoise,
     seed: int,
     drawn: Float32Array,
+    bias: Float32Array,
 ) -> tuple[WeightContrast, ...]:
     """Return what less weight of the edges, and the voxels of each part alone, would move the field by.
 
@@ -84,24 +86,32 @@ def weight_contrasts(
         Of the random fields.
     drawn : ndarray, shape (n, 3, s)
         What `CorrelationFit.noise_samples` returns for that seed at the present weights, mm.
+    bias : ndarray, shape (n, 3)
+        What penalising the field once more takes away, mm.
     """
     system, jitter = fit.system, (fit.jitter_voxels * fit.level.spacing.mean() / max(fit.residual_sd, 1e-30)) ** 2
 
-    def changed(share: Float32Array) -> tuple[Float32Array, Float32Array]:
+    def changed(share: Float32Array, of_penalties: float) -> tuple[Float32Array, Float32Array]:
         load = system.assembled(c, share[:, None] * fit.products, share[:, None] * fit.force, *penalties)
         loads = fit.noise_loads(drawn.shape[2], noise, seed, share)
-        solved = system.solved_many(np.concatenate([load[:, :, None], loads], axis=2), BIAS_TOLERANCE)[0]
+        both = [load[:, :, None], taken[:, :, None], loads]
+        solved = system.solved_many(np.concatenate(both, axis=2), BIAS_TOLERANCE)[0]
         # the weights of robust residuals make the steps shorter than they should be
-        return np.float32(noise.scale) * solved[:, :, 0], solved[:, :, 1:] - drawn
+        moved = np.float32(noise.scale) * solved[:, :, 0] - np.float32(of_penalties) * (solved[:, :, 1] - bias)
+        return moved, solved[:, :, 2:] - drawn
 
+    full = c.copy()
+    full[system.active] -= bias
+    taken = system.bending_load(full, penalties[0]) + system.dilatation_load(full, penalties[1])
     steep = jitter * (fit.gradient**2).sum(axis=1)
     soft = np.asarray((1.0 + steep) / (1.0 + JITTIER**2 * steep), dtype=np.float32)
     for inclusion in fit.inclusions:
         soft[inclusion.voxels] = 1.0
     everywhere = np.ones(len(soft), dtype=bool)
     out = []
-    for share, voxels, factor in [(soft, everywhere, OF_EDGES), *((part.astype(np.float32), part, 1.0) for part in parts)]:
-        out.append(WeightContrast(*changed(share), voxels, factor))
+    each = [(soft, everywhere, OF_EDGES, OF_PENALTIES), *((part.astype(np.float32), part, 1.0, 0.0) for part in parts)]
+    for share, voxels, factor, of_penalties in each:
+        out.append(WeightContrast(*changed(share, of_penalties), voxels, factor))
     return tuple(out)
 
 
