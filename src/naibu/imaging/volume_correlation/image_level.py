@@ -110,7 +110,7 @@ class ImageLevel:
     def listed(self, values: BoolArray) -> BoolArray:
         """Return the values (n,) of an image (nz, ny, nx), on the grid of this level, at the listed voxels."""
         z, y, x = self.index.astype(int).T[::-1]
-        return values[z, y, x]
+        return np.asarray(values[z, y, x])
 
     @property
     def axes_mm(self) -> list[FloatArray]:
