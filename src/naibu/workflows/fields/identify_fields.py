@@ -48,7 +48,7 @@ from naibu.workflows.fields.block_mesh import (
 )
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
 from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, relative_deformation
-from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ScannedObject, identified_on_smaller_cubes
+from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ObjectOnCubes, ScannedObject, identified_on_smaller_cubes
 from naibu.workflows.fields.thin_coverings import Covering, told_left_out
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import no_empty_folders, output_folder
@@ -202,18 +202,15 @@ def identify_fields(
     names = names_of_labels(labels, inside, zone_names or {})
     stated = _stated(known, list(names.values()), each_cell=each_cell)
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
-    measured = tuple((Path(p).stem, field) for p, field in zip(paths, read, strict=True))
-    scanned = ScannedObject(inside, labels, names, measured, tuple(loaded))
+    scanned = ScannedObject(inside, labels, names, tuple((Path(p).stem, f) for p, f in zip(paths, read, strict=True)), tuple(loaded))
     points = max(int(field.valid.sum()) for field in read)
-    most = points // POINTS_OF_CELL
-    usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else min(CELLS, most)
+    usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else min(CELLS, points // POINTS_OF_CELL)
     size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
     sought = () if each_cell else set(names.values()) - set(stated.values)
+    given = stated
     if not each_cell:
         scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0, known=stated.not_rigid)
-    given = stated
-    if scanned.covering is not None:
-        sought, stated = set(sought) & set(scanned.names.values()), stated.without(scanned.covering.names)
+        sought, stated = set(sought) & set(scanned.names.values()), stated.without(set(names.values()) - set(scanned.names.values()))
         size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
     cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
@@ -224,10 +221,9 @@ def identify_fields(
         found = cubes.identified(stated, law=law, bounds=bounds, each_cell=each_cell, progress=progress)
         if not (each_cell or element_size_mm):
             cubes, found = identified_on_smaller_cubes(
-                cubes, found, stated, most=min(MOST_REFINED, most), law=law, bounds=bounds, progress=progress
+                cubes, found, stated, most=min(MOST_REFINED, points // POINTS_OF_CELL), law=law, bounds=bounds, progress=progress
             )
-    if scanned.covering is not None:
-        found = told_left_out(found, scanned.covering, given.values)
+    found = told_left_out(found, scanned.covering, given.values)
     cases = cubes.load_cases
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
@@ -235,17 +231,20 @@ def identify_fields(
         load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
         region_at=cubes.region_at,
     )  # fmt: skip
-    corrected = cubes.region_at is not None and found.mesh_shift is not None
-    coarse = blurred(cubes.left_out, cubes.wrong, corrected=corrected)
-    doubts = tuple(told for name, field in measured for told in beyond_object(name, field, inside))
-    doubts += tuple(told for case in cases for told in doubts_of_field(case.name, case.field))
-    coarse += cubes.noise
+    doubts, coarse = _told(found, cubes)
     notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
-    result = FieldIdentification(
-        found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel, scanned.covering,
-        () if scanned.covering is None else tuple(name for name in scanned.covering.names if name not in given.values),
-    )  # fmt: skip
+    own = () if scanned.covering is None else tuple(name for name in scanned.covering.names if name not in given.values)
+    told = (*doubts, *coarse)
+    result = FieldIdentification(found, body, stated.relative, notes, told, inside, cubes.cell_of_voxel, scanned.covering, own)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
+
+
+def _told(found: FieldEstimate, cubes: ObjectOnCubes) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what makes the fields doubtful, and what cubes leave out or count as noise, in words."""
+    corrected, scanned = cubes.region_at is not None and found.mesh_shift is not None, cubes.scanned
+    doubts = tuple(told for name, field in scanned.fields for told in beyond_object(name, field, scanned.whole))
+    doubts += tuple(told for case in cubes.load_cases for told in doubts_of_field(case.name, case.field))
+    return doubts, (*blurred(cubes.left_out, cubes.wrong, corrected=corrected), *cubes.noise)
 
 
 def _stated(known: Sequence[str], names: Sequence[str], *, each_cell: bool) -> KnownZones:

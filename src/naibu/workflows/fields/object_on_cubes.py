@@ -70,6 +70,12 @@ class ScannedObject:
     loaded: tuple[str, ...]
     covering: Covering | None = None
 
+    @property
+    def whole(self) -> Volume:
+        """Not zero in the object and in what was left out of it."""
+        covered = False if self.covering is None else self.covering.voxels
+        return self.inside.with_values(((self.inside.values != 0) | covered).astype(np.uint8))
+
     def without_thin_coverings(
         self, size_mm: float, sought: Collection[str], *, exactly: bool, known: Collection[str] = ()
     ) -> ScannedObject:

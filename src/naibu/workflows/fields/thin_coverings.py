@@ -222,8 +222,10 @@ def _thickness_mm(voxels: BoolArray, rest: BoolArray, grid: Volume) -> float:
     return float(voxels.sum()) / max(area, 1e-12)
 
 
-def told_left_out(found: FieldEstimate, covering: Covering, known: Collection[str] = ()) -> FieldEstimate:
+def told_left_out(found: FieldEstimate, covering: Covering | None, known: Collection[str]) -> FieldEstimate:
     """Return the estimate with the zones that were left out named in its verdict first, as not determined unless they are `known`."""
+    if covering is None:
+        return found
     own, stated = (tuple(name for name in covering.names if (name in known) == wanted) for wanted in (False, True))
     limits = [LEFT_OUT.format(" and ".join(own), "they are" if len(own) > 1 else "it is")] if own else []
     limits += [STATED.format(" and ".join(stated), "are" if len(stated) > 1 else "is")] if stated else []
