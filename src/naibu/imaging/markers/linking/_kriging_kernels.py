@@ -48,6 +48,19 @@ def _forward(matrix: FloatArray, right: FloatArray, out: FloatArray) -> float:
     return total
 
 
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def _carried(matrix: FloatArray, part: FloatArray, noise: FloatArray, weights: FloatArray) -> float:
+    """Solve with the transposed lower triangle into `weights` (c,), those of the values; return the noise that they carry over."""
+    total = 0.0
+    for i in range(len(part) - 1, -1, -1):
+        value = part[i]
+        for k in range(i + 1, len(part)):
+            value -= matrix[k, i] * weights[k]
+        weights[i] = value / matrix[i, i]
+        total += weights[i] ** 2 * noise[i]
+    return total
+
+
 @njit(cache=True, parallel=True)
 def krige(
     some: IntArray,
@@ -117,13 +130,7 @@ def krige(
             right[i] = AFFINE + roughness[p] * left * left * (35.0 * t * t + 18.0 * t + 3.0) / 3.0
         explained = _forward(matrix, right, part)
         variance[p] = max(AFFINE + roughness[p] - explained, 0.0)
-        carried[p] = 0.0
-        for i in range(c - 1, -1, -1):
-            weight = part[i]
-            for k in range(i + 1, c):
-                weight -= matrix[k, i] * right[k]
-            right[i] = weight / matrix[i, i]
-            carried[p] += right[i] ** 2 * spread[i]
+        carried[p] = _carried(matrix, part, spread, right)
         for b in range(v):
             predicted[p, b] = middle[b] + np.dot(sides[b], part)
         if derivatives:
