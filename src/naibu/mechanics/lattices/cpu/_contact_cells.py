@@ -47,17 +47,46 @@ def facing(slope, curvature):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 
 @njit(cache=True, **UNCOUNTED)
-def pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+def opposite_side(half, rows, d, across):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return how deep a point at d (3,) lies below the side of a block that a face with the normal `across` looks at, and the slope of that.
+
+    `half` are the half edges of the block, `rows` the nine components of its axes.
+    """
+    depth, facing_it = np.inf, 0.0
+    for a in range(3):
+        along = rows[3 * a] * across[0] + rows[3 * a + 1] * across[1] + rows[3 * a + 2] * across[2]
+        if abs(along) > facing_it:
+            place = rows[3 * a] * d[0] + rows[3 * a + 1] * d[1] + rows[3 * a + 2] * d[2]
+            depth, facing_it = half[a] + (place if along > 0.0 else -place), abs(along)
+    return depth, np.sqrt(max(1.0 - facing_it * facing_it, 0.0))
+
+
+@njit(cache=True, **UNCOUNTED)
+def covered_within(depth, slope, width, curvature, other, other_slope):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return mean depth and covered fraction of a cell, no deeper than below the side that the face looks at."""
+    mean, part = covered(depth, slope, width, curvature)
+    if mean > 0.0 and other_slope < slope:
+        below, under = covered(other, other_slope, width, curvature)
+        if below < mean:
+            return below, under
+    return mean, part
+
+
+@njit(cache=True, **UNCOUNTED)
+def pressed(depth, slope, width, curvature, reach, other, other_slope):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return mean depth of a cell, the fraction of its multiplier that it exerts, and how fast its pressure grows with the depth.
 
     The latter is relative to the foundation. Wherever the indenter is nearer than `reach`, the multiplier over the stiffness of the
     foundation, the sum of both presses: it falls steadily to nothing as the indenter leaves, and derives from a convex potential.
+    `other` and `other_slope` are what `opposite_side` returns of a block, else infinite and 1: beside its edge the nearest side of a block
+    may stand upright on the face, and a cell that reached into it deeper than below the edge would leap as the nearest side changes.
     """
-    mean, part = covered(depth, slope, width, curvature)
+    mean, part = covered_within(depth, slope, width, curvature, other, other_slope)
     borne = facing(slope, curvature)
     if reach <= LEAST_REACH * width:
         return mean, borne * part, part
-    whole, steep = covered(depth + borne * reach, slope, width, curvature)
+    beyond = other + facing(other_slope, curvature) * reach
+    whole, steep = covered_within(depth + borne * reach, slope, width, curvature, beyond, other_slope)
     return mean, (whole - mean) / reach, steep
 
 

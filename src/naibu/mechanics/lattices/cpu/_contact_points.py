@@ -28,7 +28,7 @@ from naibu.mechanics.contact._geometry_kernels import (
     mesh_of,
     signed_distance,
 )
-from naibu.mechanics.lattices.cpu._contact_cells import covered, facing, is_far, near_flat, pressed
+from naibu.mechanics.lattices.cpu._contact_cells import covered_within, facing, is_far, near_flat, opposite_side, pressed
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
@@ -192,7 +192,10 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             exerted(own, slip, result)
             slope = _slope(n, across)
             _towards_face(n, across)
-            depth, kept, steep = pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff)
+            other, other_slope = np.inf, 1.0
+            if kind == BOX and slope > 0.0:
+                other, other_slope = opposite_side((size[0], size[1], size[2]), rows, d, across)
+            depth, kept, steep = pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff, other, other_slope)
             if form[k, 0] == 0.0:
                 found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, np.sqrt(weight))
             hard = HARD * stiff if depth > form[k, 1] else 0.0
@@ -277,9 +280,12 @@ def rest_at(x, indenters, surface, begun, history):  # type: ignore[no-untyped-d
                 reach = 0.0
                 for c in range(4):
                     reach += shapes[rule[k] + g, c] * multiplier[k, corners[f, c]] * thickness[k, f] / foundation[f, 0]
-                slope = _slope(n, across)
-                reach *= facing(slope, form[k, 0])
-                compression[p] = covered(reach - gap, slope, np.sqrt(weights[p]), form[k, 0])[0]
+                slope, width = _slope(n, across), np.sqrt(weights[p])
+                other, other_slope = np.inf, 1.0
+                if geometry[0][k] == BOX and slope > 0.0:
+                    other, other_slope = opposite_side(geometry[1][k], axes[k].ravel(), d, across)
+                near, beyond = facing(slope, form[k, 0]) * reach - gap, other + facing(other_slope, form[k, 0]) * reach
+                compression[p] = covered_within(near, slope, width, form[k, 0], beyond, other_slope)[0]
 
 
 @njit(cache=True)
