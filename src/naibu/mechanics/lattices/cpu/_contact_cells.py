@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
+from naibu.mechanics.contact._geometry_kernels import BOX, CYLINDER
 
 LEAST_SLOPE = 1e-3  # of a gap over a cell
 LEAST_FACING = 0.01
@@ -47,18 +48,27 @@ def facing(slope, curvature):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 
 @njit(cache=True, **UNCOUNTED)
-def opposite_side(half, rows, d, across):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return how deep a point at d (3,) lies below the side of a block that a face with the normal `across` looks at, and the slope of that.
+def opposite_side(kind, size, rows, d, across):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return how deep a point at d (3,) lies below the side of an indenter that a face with the normal `across` looks at, and its slope.
 
-    `half` are the half edges of the block, `rows` the nine components of its axes.
+    `kind` and `size` are those of the indenter, `rows` the nine components of its axes. Infinite, and 1, of indenters without edges.
     """
-    depth, facing_it = np.inf, 0.0
+    depth, towards = np.inf, 0.0
+    if kind != BOX and kind != CYLINDER:
+        return depth, 1.0
+    side, out = 0.0, 0.0  # distance from the axis of a cylinder, and that times how far the face looks away from there
     for a in range(3):
         along = rows[3 * a] * across[0] + rows[3 * a + 1] * across[1] + rows[3 * a + 2] * across[2]
-        if abs(along) > facing_it:
-            place = rows[3 * a] * d[0] + rows[3 * a + 1] * d[1] + rows[3 * a + 2] * d[2]
-            depth, facing_it = half[a] + (place if along > 0.0 else -place), abs(along)
-    return depth, np.sqrt(max(1.0 - facing_it * facing_it, 0.0))
+        place = rows[3 * a] * d[0] + rows[3 * a + 1] * d[1] + rows[3 * a + 2] * d[2]
+        if kind == CYLINDER and a < 2:
+            side, out = side + place * place, out + place * along
+        elif abs(along) > towards:
+            depth, towards = size[a if kind == BOX else 1] + (place if along > 0.0 else -place), abs(along)
+    if kind == CYLINDER:
+        side = np.sqrt(side)
+        if -out > towards * side:
+            depth, towards = size[0] - side, -out / side
+    return depth, np.sqrt(max(1.0 - towards * towards, 0.0))
 
 
 @njit(cache=True, **UNCOUNTED)
@@ -78,8 +88,8 @@ def pressed(depth, slope, width, curvature, reach, other, other_slope):  # type:
 
     The latter is relative to the foundation. Wherever the indenter is nearer than `reach`, the multiplier over the stiffness of the
     foundation, the sum of both presses: it falls steadily to nothing as the indenter leaves, and derives from a convex potential.
-    `other` and `other_slope` are what `opposite_side` returns of a block, else infinite and 1: beside its edge the nearest side of a block
-    may stand upright on the face, and a cell that reached into it deeper than below the edge would leap as the nearest side changes.
+    `other` and `other_slope` are what `opposite_side` returns: beside an edge of the indenter its nearest side may stand upright on the
+    face, and a cell that reached in there deeper than below the other side would leap as the nearest side changes.
     """
     mean, part = covered_within(depth, slope, width, curvature, other, other_slope)
     borne = facing(slope, curvature)

@@ -192,9 +192,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             exerted(own, slip, result)
             slope = _slope(n, across)
             _towards_face(n, across)
-            other, other_slope = np.inf, 1.0
-            if kind == BOX and slope > 0.0:
-                other, other_slope = opposite_side((size[0], size[1], size[2]), rows, d, across)
+            other, other_slope = opposite_side(kind, (size[0], size[1], size[2]), rows, d, across)
             depth, kept, steep = pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff, other, other_slope)
             if form[k, 0] == 0.0:
                 found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, np.sqrt(weight))
@@ -281,9 +279,7 @@ def rest_at(x, indenters, surface, begun, history):  # type: ignore[no-untyped-d
                 for c in range(4):
                     reach += shapes[rule[k] + g, c] * multiplier[k, corners[f, c]] * thickness[k, f] / foundation[f, 0]
                 slope, width = _slope(n, across), np.sqrt(weights[p])
-                other, other_slope = np.inf, 1.0
-                if geometry[0][k] == BOX and slope > 0.0:
-                    other, other_slope = opposite_side(geometry[1][k], axes[k].ravel(), d, across)
+                other, other_slope = opposite_side(geometry[0][k], geometry[1][k], axes[k].ravel(), d, across)
                 near, beyond = facing(slope, form[k, 0]) * reach - gap, other + facing(other_slope, form[k, 0]) * reach
                 compression[p] = covered_within(near, slope, width, form[k, 0], beyond, other_slope)[0]
 
