@@ -19,6 +19,7 @@ import numpy as np
 from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import (
     BOX,
+    CYLINDER,
     MESH,
     PLANE,
     SPHERE,
@@ -36,6 +37,7 @@ TANGENTIAL = 16.7  # stiffness of a point before it slips, of a foundation one e
 MARGIN = 0.25  # of the radius of a face, by which it may be off what was foreseen
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
+UPRIGHT = 0.7  # slope above which the side of an indenter that is nearest may not be the one that a face looks at
 STRAIGHT = 0.5  # cosine of the angle between the frictions of two passes below which a point turns
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
 # velocity of the indenter, covered fraction of the cell, unit vector of friction that slides, drag missing along it, whether that turned
@@ -192,7 +194,9 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             exerted(own, slip, result)
             slope = _slope(n, across)
             _towards_face(n, across)
-            other, other_slope = opposite_side(kind, (size[0], size[1], size[2]), rows, d, across)
+            other, other_slope = np.inf, 1.0
+            if kind in (BOX, CYLINDER) and (gap > 0.0 or slope > UPRIGHT):  # else the nearest side is the one that the face looks at
+                other, other_slope = opposite_side(kind, (size[0], size[1], size[2]), rows, d, across)
             depth, kept, steep = pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff, other, other_slope)
             if form[k, 0] == 0.0:
                 found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, np.sqrt(weight))
