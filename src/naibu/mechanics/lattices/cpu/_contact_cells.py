@@ -83,13 +83,26 @@ def covered_within(depth, slope, width, curvature, other, other_slope):  # type:
 
 
 @njit(cache=True, **UNCOUNTED)
-def pressed(depth, slope, width, curvature, reach, other, other_slope):  # type: ignore[no-untyped-def]  # pragma: no cover
+def pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return mean depth of a cell, the fraction of its multiplier that it exerts, and how fast its pressure grows with the depth.
 
     The latter is relative to the foundation. Wherever the indenter is nearer than `reach`, the multiplier over the stiffness of the
     foundation, the sum of both presses: it falls steadily to nothing as the indenter leaves, and derives from a convex potential.
-    `other` and `other_slope` are what `opposite_side` returns: beside an edge of the indenter its nearest side may stand upright on the
-    face, and a cell that reached in there deeper than below the other side would leap as the nearest side changes.
+    """
+    mean, part = covered(depth, slope, width, curvature)
+    borne = facing(slope, curvature)
+    if reach <= LEAST_REACH * width:
+        return mean, borne * part, part
+    whole, steep = covered(depth + borne * reach, slope, width, curvature)
+    return mean, (whole - mean) / reach, steep
+
+
+@njit(cache=True, **UNCOUNTED)
+def pressed_by_edge(depth, slope, width, curvature, reach, other, other_slope):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Do what `pressed` does beside an edge of an indenter, whose nearest side may stand upright on the face.
+
+    `other` and `other_slope` are what `opposite_side` returns: a cell that reached into the nearest side deeper than below the other one
+    would leap as the nearest side changes, with no solution in between.
     """
     mean, part = covered_within(depth, slope, width, curvature, other, other_slope)
     borne = facing(slope, curvature)

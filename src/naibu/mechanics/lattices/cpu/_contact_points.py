@@ -29,7 +29,7 @@ from naibu.mechanics.contact._geometry_kernels import (
     mesh_of,
     signed_distance,
 )
-from naibu.mechanics.lattices.cpu._contact_cells import covered_within, facing, is_far, near_flat, opposite_side, pressed
+from naibu.mechanics.lattices.cpu._contact_cells import covered_within, facing, is_far, near_flat, opposite_side, pressed, pressed_by_edge
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
@@ -194,12 +194,14 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             exerted(own, slip, result)
             slope = _slope(n, across)
             _towards_face(n, across)
-            other, other_slope = np.inf, 1.0
-            if kind in (BOX, CYLINDER) and (gap > 0.0 or slope > UPRIGHT):  # else the nearest side is the one that the face looks at
+            width, reach = np.sqrt(weight), carried / stiff
+            if kind in (BOX, CYLINDER) and (gap > 0.0 or slope > UPRIGHT):  # the nearest side may not be the one that the face looks at
                 other, other_slope = opposite_side(kind, (size[0], size[1], size[2]), rows, d, across)
-            depth, kept, steep = pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff, other, other_slope)
+                depth, kept, steep = pressed_by_edge(-gap, slope, width, form[k, 0], reach, other, other_slope)
+            else:
+                depth, kept, steep = pressed(-gap, slope, width, form[k, 0], reach)
             if form[k, 0] == 0.0:
-                found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, np.sqrt(weight))
+                found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, width)
             hard = HARD * stiff if depth > form[k, 1] else 0.0
             own_pressure = stiff * (depth - compression[p]) + spring * extension[p] + kept * carried
             pressure = own_pressure + hard * max(depth - form[k, 1], 0.0) if kept > 0.0 else 0.0
