@@ -195,11 +195,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             slope = _slope(n, across)
             _towards_face(n, across)
             width, reach = np.sqrt(weight), carried / stiff
-            if kind in (BOX, CYLINDER) and (gap > 0.0 or slope > UPRIGHT):  # the nearest side may not be the one that the face looks at
-                other, other_slope = opposite_side(kind, (size[0], size[1], size[2]), rows, d, across)
-                depth, kept, steep = pressed_by_edge(-gap, slope, width, form[k, 0], reach, other, other_slope)
-            else:
-                depth, kept, steep = pressed(-gap, slope, width, form[k, 0], reach)
+            depth, kept, steep = _pressed_at(kind, (size[0], size[1], size[2]), rows, d, across, gap, slope, width, form[k, 0], reach)
             if form[k, 0] == 0.0:
                 found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, width)
             hard = HARD * stiff if depth > form[k, 1] else 0.0
@@ -217,6 +213,15 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
                 wrong_friction += weight * _return_mapping(own, traction[p], slip, drag, pressure, friction[k], slid, p, result)
                 limits += weight * friction[k, 1] * pressure
     return wrong, wrong_friction, total, limits
+
+
+@njit(cache=True, **UNCOUNTED)
+def _pressed_at(kind, size, rows, d, across, gap, slope, width, curvature, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Do what `pressed` does, or `pressed_by_edge` where the nearest side of an indenter may not be the one that the face looks at."""
+    if kind in (BOX, CYLINDER) and (gap > 0.0 or slope > UPRIGHT):
+        other, other_slope = opposite_side(kind, size, rows, d, across)
+        return pressed_by_edge(-gap, slope, width, curvature, reach, other, other_slope)
+    return pressed(-gap, slope, width, curvature, reach)
 
 
 @njit(cache=True, **UNCOUNTED)
