@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
+from naibu.mechanics.contact._geometry_kernels import BOX, CYLINDER
 
 LEAST_SLOPE = 1e-3  # of a gap over a cell
 LEAST_FACING = 0.01
@@ -47,6 +48,41 @@ def facing(slope, curvature):  # type: ignore[no-untyped-def]  # pragma: no cove
 
 
 @njit(cache=True, **UNCOUNTED)
+def opposite_side(kind, size, rows, d, across):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return how deep a point at d (3,) lies below the side of an indenter that a face with the normal `across` looks at, and its slope.
+
+    `kind` and `size` are those of the indenter, `rows` the nine components of its axes. Infinite, and 1, of indenters without edges.
+    """
+    depth, towards = np.inf, 0.0
+    if kind != BOX and kind != CYLINDER:
+        return depth, 1.0
+    side, out = 0.0, 0.0  # distance from the axis of a cylinder, and that times how far the face looks away from there
+    for a in range(3):
+        along = rows[3 * a] * across[0] + rows[3 * a + 1] * across[1] + rows[3 * a + 2] * across[2]
+        place = rows[3 * a] * d[0] + rows[3 * a + 1] * d[1] + rows[3 * a + 2] * d[2]
+        if kind == CYLINDER and a < 2:
+            side, out = side + place * place, out + place * along
+        elif abs(along) > towards:
+            depth, towards = size[a if kind == BOX else 1] + (place if along > 0.0 else -place), abs(along)
+    if kind == CYLINDER:
+        side = np.sqrt(side)
+        if -out > towards * side:
+            depth, towards = size[0] - side, -out / side
+    return depth, np.sqrt(max(1.0 - towards * towards, 0.0))
+
+
+@njit(cache=True, **UNCOUNTED)
+def covered_within(depth, slope, width, curvature, other, other_slope):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return mean depth and covered fraction of a cell, no deeper than below the side that the face looks at."""
+    mean, part = covered(depth, slope, width, curvature)
+    if mean > 0.0 and other_slope < slope:
+        below, under = covered(other, other_slope, width, curvature)
+        if below < mean:
+            return below, under
+    return mean, part
+
+
+@njit(cache=True, **UNCOUNTED)
 def pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return mean depth of a cell, the fraction of its multiplier that it exerts, and how fast its pressure grows with the depth.
 
@@ -58,6 +94,22 @@ def pressed(depth, slope, width, curvature, reach):  # type: ignore[no-untyped-d
     if reach <= LEAST_REACH * width:
         return mean, borne * part, part
     whole, steep = covered(depth + borne * reach, slope, width, curvature)
+    return mean, (whole - mean) / reach, steep
+
+
+@njit(cache=True, **UNCOUNTED)
+def pressed_by_edge(depth, slope, width, curvature, reach, other, other_slope):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Do what `pressed` does beside an edge of an indenter, whose nearest side may stand upright on the face.
+
+    `other` and `other_slope` are what `opposite_side` returns: a cell that reached into the nearest side deeper than below the other one
+    would leap as the nearest side changes, with no solution in between.
+    """
+    mean, part = covered_within(depth, slope, width, curvature, other, other_slope)
+    borne = facing(slope, curvature)
+    if reach <= LEAST_REACH * width:
+        return mean, borne * part, part
+    beyond = other + facing(other_slope, curvature) * reach
+    whole, steep = covered_within(depth + borne * reach, slope, width, curvature, beyond, other_slope)
     return mean, (whole - mean) / reach, steep
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import (
     BOX,
+    CYLINDER,
     MESH,
     PLANE,
     SPHERE,
@@ -28,7 +29,7 @@ from naibu.mechanics.contact._geometry_kernels import (
     mesh_of,
     signed_distance,
 )
-from naibu.mechanics.lattices.cpu._contact_cells import covered, facing, is_far, near_flat, pressed
+from naibu.mechanics.lattices.cpu._contact_cells import covered_within, facing, is_far, near_flat, opposite_side, pressed, pressed_by_edge
 from naibu.mechanics.lattices.cpu._contact_operator import FACES
 
 FREE, STICK, SLIDE = range(3)
@@ -36,6 +37,7 @@ TANGENTIAL = 16.7  # stiffness of a point before it slips, of a foundation one e
 MARGIN = 0.25  # of the radius of a face, by which it may be off what was foreseen
 HARD = 20.0  # how many times the foundation is stiffer where an indenter is deep in it
 STEEP, FLAT = -0.7, -0.3  # cosines of the angle between the normals of an indenter and of a face, between which the latter takes over
+UPRIGHT = 0.7  # slope above which the side of an indenter that is nearest may not be the one that a face looks at
 STRAIGHT = 0.5  # cosine of the angle between the frictions of two passes below which a point turns
 # columns of what is kept of a linearized point: normal, pressure and friction at no slip, drags along the normal (kPa s/mm) and across,
 # velocity of the indenter, covered fraction of the cell, unit vector of friction that slides, drag missing along it, whether that turned
@@ -192,9 +194,10 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             exerted(own, slip, result)
             slope = _slope(n, across)
             _towards_face(n, across)
-            depth, kept, steep = pressed(-gap, slope, np.sqrt(weight), form[k, 0], carried / stiff)
+            width, reach = np.sqrt(weight), carried / stiff
+            depth, kept, steep = _pressed_at(kind, (size[0], size[1], size[2]), rows, d, across, gap, slope, width, form[k, 0], reach)
             if form[k, 0] == 0.0:
-                found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, np.sqrt(weight))
+                found[p, UNDER], found[p, BORNE] = near_flat(gap, slope, width)
             hard = HARD * stiff if depth > form[k, 1] else 0.0
             own_pressure = stiff * (depth - compression[p]) + spring * extension[p] + kept * carried
             pressure = own_pressure + hard * max(depth - form[k, 1], 0.0) if kept > 0.0 else 0.0
@@ -210,6 +213,15 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
                 wrong_friction += weight * _return_mapping(own, traction[p], slip, drag, pressure, friction[k], slid, p, result)
                 limits += weight * friction[k, 1] * pressure
     return wrong, wrong_friction, total, limits
+
+
+@njit(cache=True, **UNCOUNTED)
+def _pressed_at(kind, size, rows, d, across, gap, slope, width, curvature, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Do what `pressed` does, or `pressed_by_edge` where the nearest side of an indenter may not be the one that the face looks at."""
+    if kind in (BOX, CYLINDER) and (gap > 0.0 or slope > UPRIGHT):
+        other, other_slope = opposite_side(kind, size, rows, d, across)
+        return pressed_by_edge(-gap, slope, width, curvature, reach, other, other_slope)
+    return pressed(-gap, slope, width, curvature, reach)
 
 
 @njit(cache=True, **UNCOUNTED)
@@ -277,9 +289,10 @@ def rest_at(x, indenters, surface, begun, history):  # type: ignore[no-untyped-d
                 reach = 0.0
                 for c in range(4):
                     reach += shapes[rule[k] + g, c] * multiplier[k, corners[f, c]] * thickness[k, f] / foundation[f, 0]
-                slope = _slope(n, across)
-                reach *= facing(slope, form[k, 0])
-                compression[p] = covered(reach - gap, slope, np.sqrt(weights[p]), form[k, 0])[0]
+                slope, width = _slope(n, across), np.sqrt(weights[p])
+                other, other_slope = opposite_side(geometry[0][k], geometry[1][k], axes[k].ravel(), d, across)
+                near, beyond = facing(slope, form[k, 0]) * reach - gap, other + facing(other_slope, form[k, 0]) * reach
+                compression[p] = covered_within(near, slope, width, form[k, 0], beyond, other_slope)[0]
 
 
 @njit(cache=True)
