@@ -34,7 +34,7 @@ UNLIKELY = 1e-3  # probability of so large differences by chance, below which ex
 APART = 3.0  # standard deviations between two estimates of one parameter that is named
 # difference from which on it matters: of the logarithm of a stiffness, of a Poisson's ratio, of another parameter of a law
 FACTOR, POISSON, SHAPE = 0.25, 0.02, 0.3
-ADVICE = "identify them one by one, or state a batch where they are of other castings"
+ADVICE = "question the law, identify them one by one, or state a batch where they are of other castings"
 REPEATED = 4  # times that robust weights and the scale of the noise are set anew
 
 
