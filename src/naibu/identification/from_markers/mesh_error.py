@@ -45,11 +45,14 @@ class MeshError:
         Root mean square error of a coordinate of a marker from the elements.
     step : ndarray, shape (p,)
         Change of the free parameters that would fit best with vanishing elements, on the optimiser's scale.
+    moved : tuple of ndarray, shapes (k, 3)
+        By how much vanishing elements would place the markers of every load case elsewhere at the same parameters, mm.
     """
 
     element_size_mm: float
     markers_mm: float
     step: FloatArray
+    moved: tuple[FloatArray, ...]
 
     @property
     def covariance(self) -> FloatArray:
@@ -95,7 +98,8 @@ def mesh_error(
     if finer:
         factor = 1.0 if max(stiffnesses, default=0.0) > TRUSTED else 1.0 / (1.0 - RATIO**-ORDER)
     squares = np.concatenate([change[np.isfinite(f.residual)] ** 2 for f, change in zip(match.fits, changes, strict=True)])
-    return MeshError(max(sizes), abs(factor) * float(np.sqrt(squares.mean())), factor * step)
+    markers_mm = abs(factor) * float(np.sqrt(squares.mean()))
+    return MeshError(max(sizes), markers_mm, factor * step, tuple(factor * change for change in changes))
 
 
 def marker_error(load_case: MarkerLoadCase, fit: LoadCaseFit, values: Mapping[str, float]) -> FloatArray:

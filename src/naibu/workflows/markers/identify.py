@@ -136,8 +136,9 @@ def identify(
     workers, cluster
         Where experiments are predicted from the others, one a task (`naibu.workflows.parallel.worker_count.Workers`).
     progress : callable, optional
-        Gets reports of the stages "calibration on larger elements" (of large meshes), "calibration" and, with `cross_validate`, "without
-        EXPERIMENT" (`naibu.core.progress`); "experiments left out" where workers compute them.
+        Gets reports of the stages "calibration on larger elements" (of large meshes), "calibration", "EXPERIMENT alone" of two that seem
+        to contradict each other, and, with `cross_validate`, "without EXPERIMENT" (`naibu.core.progress`); "experiments left out" where
+        workers compute them.
 
     Returns
     -------
@@ -180,7 +181,7 @@ def identify(
         labels = [f"{e.name}/{s.name}" for e in loaded for s in _with_states(e, states or {}).loaded_states]
         one_of = "one of " * (len(labels) > 1) + ", ".join(labels)
         raise ConvergenceError(f"{one_of} cannot be solved with the starting values: {error}") from error
-    verdict = verdict_of(calibration, doubts, outliers)
+    verdict = verdict_of(calibration, doubts, outliers, progress)
     model = replace(CalibratedModel.of(calibration, provenance), reservation=verdict.reservation)
     left_in_turn = [_with_states(e, states or {}) for e in loaded] if cross_validate else []
     result, trouble = _compared(calibration, model, verdict, left_in_turn, where, progress, kept)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import pytest
-from pressed_gels import identified
+from dataclasses import replace
 
+import pytest
+from pressed_gels import identified, scanned
+
+from naibu.identification.from_markers.calibration import calibrate
 from naibu.identification.from_markers.checks.layer_heights import contradicted_layers
 from naibu.identification.from_markers.checks.verdict import verdict_of
+from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.verdict import Explanation
 
 
@@ -24,3 +28,10 @@ def test_wrong_heights_are_told_with_what_the_markers_say(stated: float, least: 
     assert least <= told <= most
     judged = verdict_of(found)
     assert judged.explanation is Explanation.IN_PART and doubt.text in judged.reasons
+
+
+def test_a_layer_that_no_loaded_state_shows_is_not_doubted() -> None:
+    experiment = scanned()[0]
+    spare = replace(experiment, name="spare", states=experiment.states[:1])
+    found = calibrate([experiment, spare], settings=ModelSettings(element_size_mm=10.0, contact="stick"), with_mesh_error=False)
+    assert contradicted_layers(found) == ()

@@ -31,7 +31,7 @@ def contradicted_layers(calibration: Calibration) -> tuple[Doubt, ...]:
     doubts = []
     for k, p in enumerate(free):
         name, _, stated = p.name.partition(LAYER)
-        if not stated:
+        if not stated or equations.data[k, k] == 0.0:  # nothing was seen of an experiment without a loaded state
             continue
         hessian, gradient = equations.hessian.copy(), equations.gradient.copy()
         hessian[k, k] -= 1.0 / p.prior_sd**2

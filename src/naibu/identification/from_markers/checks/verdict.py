@@ -2,8 +2,8 @@
 
 A search that converged has found a minimum, which says nothing about how low it is. The verdict weighs what tells data apart that the model
 cannot explain: the residuals in units of the noise, how much of the deformation they leave unexplained, whether an affine map does as well,
-the part of the residuals that neighbours share (noise is not shared), estimates far from what was
-known beforehand, and heights of indenters and layers that contradict the stated ones.
+the part of the residuals that neighbours share (noise is not shared), estimates far from what was known beforehand, heights of indenters
+and layers that contradict the stated ones, and experiments that contradict each other.
 """
 
 from __future__ import annotations
@@ -15,9 +15,11 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.parameters import ParameterSet
+from naibu.core.progress import Progress
 from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.checks.contradicting_experiments import contradicted_experiments
 from naibu.identification.from_markers.checks.layer_heights import LAYER, contradicted_layers
 from naibu.identification.from_markers.checks.marker_checks import Doubt, robust_affine
 from naibu.identification.from_markers.checks.marker_outliers import Outlier
@@ -102,7 +104,9 @@ class _Flaw:
     grave: bool = False
 
 
-def verdict_of(calibration: Calibration, doubts: Sequence[Doubt] = (), outliers: Sequence[Outlier] = ()) -> Verdict:
+def verdict_of(
+    calibration: Calibration, doubts: Sequence[Doubt] = (), outliers: Sequence[Outlier] = (), progress: Progress | None = None
+) -> Verdict:
     """Return the verdict on a calibration.
 
     Parameters
@@ -113,11 +117,13 @@ def verdict_of(calibration: Calibration, doubts: Sequence[Doubt] = (), outliers:
         From `naibu.identification.from_markers.checks.marker_checks.check_markers`.
     outliers : sequence of Outlier
         Markers that were left out.
+    progress : callable, optional
+        Gets reports where experiments seem to contradict each other, and are identified each by itself.
     """
     match = calibration.match
     values = match.parameters.values()
     cases = [_evidence(t, f, values) for t, f in zip(calibration.load_cases, match.fits, strict=True)]
-    doubts = (*doubts, *coarse_elements(calibration), *contradicted_layers(calibration))
+    doubts = (*contradicted_experiments(calibration, progress), *doubts, *coarse_elements(calibration), *contradicted_layers(calibration))
     deviations = prior_deviations(match.parameters, calibration.priors)
     others = {name: d for name, d in deviations.items() if LAYER not in name}
     return verdict(cases, others, match.noise_factor, match.status, doubts, outliers)

@@ -22,6 +22,12 @@ def shape_parameter(material: str, name: str) -> str:
     return f"{material}: {name}"
 
 
+def is_of_material(name: str) -> bool:
+    """Whether a parameter is one of a material or a batch, which all objects of it share: a stiffness, a Poisson's ratio, a shape."""
+    kinds = ("young_modulus", "poisson_ratio", "stiffness", *(kind for kinds in SHAPE_NAMES.values() for kind in kinds))
+    return name.endswith(tuple(f": {kind}" for kind in kinds))
+
+
 def law_of_shape(kind: str, own: str) -> str | None:
     """Return the name of the law that has the shape parameter `kind`: `own` where it does; None where no law has it."""
     laws = [law for law, kinds in SHAPE_NAMES.items() if kind in kinds]
