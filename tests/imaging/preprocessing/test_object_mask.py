@@ -130,6 +130,12 @@ def test_jumps_between_slices_are_found() -> None:
     assert not len(mask_jumps(np.zeros_like(mask)))
 
 
+def test_the_tip_of_an_object_is_no_jump_in_a_few_slices_either() -> None:
+    mask = np.zeros((3, 20, 20), dtype=bool)
+    mask[0], mask[1, :2, :2], mask[2, 0, 0] = True, True, True
+    assert mask_jumps(mask).tolist() == [1]
+
+
 @pytest.mark.parametrize("slice_mm", [1.0, 2.0, 3.0])
 @pytest.mark.parametrize("phase", [0.1, 0.5, 0.9])
 def test_the_rounded_ends_of_an_object_in_thick_slices_are_no_jumps(slice_mm: float, phase: float) -> None:

@@ -141,11 +141,12 @@ def mask_jumps(mask: BoolArray) -> IntArray:
     inner = mask[filled[0] : filled[-1] + 1]
     larger = np.maximum(inner[1:].sum(axis=(1, 2)), inner[:-1].sum(axis=(1, 2)))
     changed = (inner[1:] != inner[:-1]).sum(axis=(1, 2))
-    if len(changed) <= STEADY:
-        return np.asarray(filled[0] + 1 + np.flatnonzero(changed > JUMP * larger), dtype=np.int64)
-    grown = np.pad(np.diff(inner.sum(axis=(1, 2))), STEADY, mode="reflect")
-    around = np.delete(np.lib.stride_tricks.sliding_window_view(grown, 2 * STEADY + 1), STEADY, axis=1)
-    jumps = (changed - STEADILY * np.abs(np.median(around, axis=1)) > JUMP * larger) & (larger > LEAST_AREA * area.max())
+    steady: FloatArray = np.zeros(len(changed))
+    if len(changed) > STEADY:
+        grown = np.pad(np.diff(inner.sum(axis=(1, 2))), STEADY, mode="reflect")
+        around = np.delete(np.lib.stride_tricks.sliding_window_view(grown, 2 * STEADY + 1), STEADY, axis=1)
+        steady = STEADILY * np.abs(np.median(around, axis=1))
+    jumps = (changed - steady > JUMP * larger) & (larger > LEAST_AREA * area.max())
     return np.asarray(filled[0] + 1 + np.flatnonzero(jumps), dtype=np.int64)
 
 

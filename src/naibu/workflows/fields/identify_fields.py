@@ -204,14 +204,14 @@ def identify_fields(
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     scanned = ScannedObject(inside, labels, names, tuple((Path(p).stem, f) for p, f in zip(paths, read, strict=True)), tuple(loaded))
     points = max(int(field.valid.sum()) for field in read)
-    usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else min(CELLS, points // POINTS_OF_CELL)
-    size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
+    usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS)
+    size = element_size_mm or scanned.edge_mm(usual)
     sought = () if each_cell else set(names.values()) - set(stated.values)
     given = stated
     if not each_cell:
         scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0, known=stated.not_rigid)
         sought, stated = set(sought) & set(scanned.names.values()), stated.without(set(names.values()) - set(scanned.names.values()))
-        size = element_size_mm or (scanned.volume_mm3 / max(usual, LEAST_CELLS)) ** (1.0 / 3.0)
+        size = element_size_mm or scanned.edge_mm(usual)
     cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])

@@ -87,6 +87,10 @@ class ScannedObject:
         )  # fmt: skip
         return self if covering is None else replace(self, inside=left, names=names, covering=covering)
 
+    def edge_mm(self, cells: int) -> float:
+        """Return the edge length, mm, of cubes of which so many fill the object."""
+        return float((self.volume_mm3 / cells) ** (1.0 / 3.0))
+
     @property
     def volume_mm3(self) -> float:
         """Volume of the object."""
