@@ -44,7 +44,9 @@ def read_json(path: Path) -> Any:
     with guarded_reading(path, "JSON"):
         try:
             return json.loads(content)
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: is not JSON (byte {error.start} is no text)") from error
+        except json.JSONDecodeError as error:
             raise InputError(f"{path}: is not JSON ({error})") from error
 
 
