@@ -22,7 +22,7 @@ class NaibuHelp(Directive):
         if importlib.util.find_spec("naibu.cli") is None:
             return [nodes.paragraph(text="The command line is not part of this version.")]
         command = [sys.executable, "-c", "import sys; from naibu.cli import main; sys.argv[0] = 'naibu'; main()", *arguments]
-        environment = os.environ | {"COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+        environment = os.environ | {"COLUMNS": "86", "NO_COLOR": "1", "TERM": "dumb"}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if done.returncode:
             raise self.error(f"naibu {' '.join(arguments)} ended with code {done.returncode}: {done.stderr.strip()}")

@@ -21,7 +21,7 @@ motion = simulate_skin(modes, layers, load, times)
 
 figure, (left, right) = plt.subplots(1, 2, figsize=(8.5, 3.2), layout="constrained")
 left.plot(times, 1000.0 * motion.indentation, color="#2a788e")
-left.set(xlabel="time (s)", ylabel="indentation (um)")
+left.set(xlabel="time (s)", ylabel="indentation (µm)")
 for pressure in (0.3, 0.5, 1.0):
     right.plot(times, motion.pale_area(pressure), label=f"above {pressure:g} kPa")
 right.set(xlabel="time (s)", ylabel="pale area (mm$^2$)")

@@ -28,5 +28,7 @@ for push_mm, dashes in ((5.0, "--"), (10.0, "-")):
     for name, values, colour in zip(planned.names, np.array(spread).T, ("#2a788e", "#d95f02"), strict=True):
         axes.loglog(noises, values, dashes, color=colour, marker="o", markersize=4, label=f"{name}, pushed by {push_mm:g} mm")
 axes.set(xlabel="noise of the displacement (mm)", ylabel="SD of Young's modulus (%)")
+axes.set_xticks(noises, [f"{sd:g}" for sd in noises])
+axes.xaxis.set_minor_formatter("")
 axes.legend(fontsize=8)
 plt.show()

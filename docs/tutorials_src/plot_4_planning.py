@@ -44,13 +44,16 @@ pushes = {
     "press, then shear": [(0.0, 0.0, -10.0), (10.0, 0.0, 0.0)],
 }
 table = {name: planned(which, 0.1) for name, which in pushes.items()}
-figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+figure, axes = plt.subplots(figsize=(6, 3.2), layout="constrained")
 at = np.arange(len(table))
 for k, (name, shift) in enumerate(zip(guess, (0.2, -0.2), strict=True)):
-    left.barh(at + shift, [100.0 * sd[k] for sd in table.values()], 0.36, label=name)
-left.set_yticks(at, list(table))
-left.set(xlabel="SD of Young's modulus (%)", ylabel="push")
-left.legend()
+    axes.barh(at + shift, [100.0 * sd[k] for sd in table.values()], 0.36, label=name)
+axes.set_yticks(at, list(table))
+axes.set(xlabel="SD of Young's modulus (%)", ylabel="push")
+axes.legend()
+plt.show()
+for name, sd in table.items():
+    print(f"{name}: " + ", ".join(f"{part} {100.0 * value:.2g} %" for part, value in zip(guess, sd, strict=True)))
 
 # %%
 # How many points
@@ -58,11 +61,12 @@ left.legend()
 # The standard deviation falls with the square root of the number of points, and in proportion to the noise.
 steps = (1, 2, 4)
 counts = [len(body.mesh.points[::every]) for every in steps]
+figure, axes = plt.subplots(figsize=(5, 3.4), layout="constrained")
 for noise in (0.05, 0.2):
     spread = [100.0 * planned(pushes["press"], noise, every).max() for every in steps]
-    right.loglog(counts, spread, "o-", label=f"noise {noise:g} mm")
-right.set(xlabel="points measured", ylabel="largest SD of a modulus (%)")
-right.legend()
+    axes.loglog(counts, spread, "o-", label=f"noise {noise:g} mm")
+axes.set(xlabel="points measured", ylabel="largest SD of a modulus (%)")
+axes.set_xticks(counts, [str(count) for count in counts])
+axes.xaxis.set_minor_formatter("")
+axes.legend()
 plt.show()
-for name, sd in table.items():
-    print(f"{name}: " + ", ".join(f"{part} {100.0 * value:.2g} %" for part, value in zip(guess, sd, strict=True)))

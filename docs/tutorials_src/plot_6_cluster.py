@@ -79,4 +79,6 @@ for k, document in enumerate(documents.values()):
         )
 axes.set(xlabel="friction between gel and acrylic, with 95 % interval", ylabel="sample", xscale="log", title="Three samples, one table")
 axes.set_yticks(range(len(samples)), samples)
+axes.set_xticks(ticks := [0.03, 0.1, 0.3], [f"{friction:g}" for friction in ticks])
+axes.xaxis.set_minor_formatter("")
 plt.show()

@@ -71,9 +71,12 @@ def sense(
         Replace results, or files of your own, that the folder already holds.
     """
     options, places = pair or PairOptions(), where or WorkerOptions()
+    if method != "default":
+        require_left_out("goes with the method default", memory_gb=memory_gb is not None)
     plan = _memory_plan(reference, options, places, memory_gb, resume) if method == "default" else None
     if plan is None:
-        require_left_out("goes with scans that are measured block by block", resume=resume, workers=places != WorkerOptions())
+        alone = {"resume": resume, "workers": places.workers != 1, "cluster": places.cluster is not None}
+        require_left_out("goes with scans that are measured block by block", **alone)
         run, stores = _sense_in_memory((reference, deformed), method, options, out, multiscale, overwrite)
     else:
         run, stores = _sense_by_blocks((reference, deformed), plan, options, places, out, multiscale, overwrite, resume), ()
@@ -97,6 +100,7 @@ def _memory_plan(reference: Path, options: PairOptions, places: WorkerOptions, m
 
     shape = stored_shape(reference, options.spacing_mm)
     if shape is None:
+        require_left_out("goes with scans in Zarr, OME-Zarr, HDF5 or TIFF stacks; others are read whole", memory_gb=memory_gb is not None)
         return None
     plan = MemoryPlan.of(shape, memory_gb, max(1, places.workers))
     return plan if plan.by_blocks or resume else None

@@ -120,7 +120,7 @@ def simulate(
         Where a lattice is computed: cpu, cuda (an NVIDIA GPU; needs naibu[gpu]), or warp-cpu (the GPU's kernels on the CPU, for tests).
     example
         Print the file of a study as a template for your own: naibu simulate --example > my_study.toml, or, of a sensing chip,
-        naibu simulate chip --example > my_chip.toml; the same for indentation, fingertip, ischemia and sweep
+        naibu simulate chip --example > my_chip.toml; the same for indentation, fingertip, ischemia and sweep.
     """
     from naibu.workflows.studies.simulate import example_text, named_studies
     from naibu.workflows.studies.simulate import simulate as simulated

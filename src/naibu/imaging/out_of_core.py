@@ -365,7 +365,7 @@ def _pair(reference: ChunkedVolume, deformed: ChunkedVolume, block: ArrayLike) -
     known = _moments(reference, block), _moments(deformed, block)
     for name, m in zip(("reference", "deformed"), known, strict=True):
         if not m.high > m.low:
-            raise InputError(f"the {name} volume is constant (every voxel is {m.low:g}): there is nothing to match")
+            raise InputError(f"the {name} volume is constant (every voxel is {m.low:g}): there is nothing to match; check the file")
     return known
 
 

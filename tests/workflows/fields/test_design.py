@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -133,7 +134,7 @@ def test_a_push_that_shows_nothing_is_no_best_one(tmp_path: Path) -> None:
 def test_what_is_missing_or_wrong_is_told() -> None:
     good = {"size_mm": SIZE, "layers": LAYERS, **MATERIALS, "pushes": ["z+=0,0,-1"]}
     for change, message in (
-        ({"pushes": []}, "make 0 plans"),
+        ({"pushes": []}, "without .*pushes"),
         ({"pushes": ["z+=0,0"]}, "must name a side and its displacement"),
         ({"pushes": ["top=0,0,1"]}, "side 'top' is not known"),
         ({"points": [3]}, "points must lie between"),
@@ -144,6 +145,10 @@ def test_what_is_missing_or_wrong_is_told() -> None:
         ({"known": []}, "nothing sets the scale"),
         ({"layers": ()}, "needs `layers`"),
         ({"layers": LAYERS[:1]}, "must fill the height"),
+        ({"layers": (LAYERS[0], replace(LAYERS[1], from_base_mm=LAYERS[0].to_base_mm + 1.5))}, "from 20 to 21.5 mm there is none"),
+        ({"layers": (LAYERS[0], replace(LAYERS[1], from_base_mm=LAYERS[0].to_base_mm - 1.5))}, "from 18.5 to 20 mm there is more than one"),
+        ({"pushes": ["z+=0,0,-40"]}, "z.=0,0,-40.*40 mm long along z.*push less far"),
+        ({"pushes": ["x-=45,0,0"]}, "mm long along x"),
         ({"size_mm": None}, "give `zones`"),
     ):
         with pytest.raises(InputError, match=message):

@@ -60,10 +60,10 @@ def require_contrast(volume: Volume, name: str) -> None:
     """
     values = np.asarray(volume.values)
     if values.dtype.kind == "f" and np.isnan(values).all():
-        raise InputError(f"the {name} volume shows nothing: every voxel is NaN")
+        raise InputError(f"the {name} volume shows nothing: every voxel is NaN; check the file")
     low, high = float(np.fmin.reduce(values, axis=None)), float(np.fmax.reduce(values, axis=None))
     if low == high:
-        raise InputError(f"the {name} volume is constant (every voxel is {low:g}): there is nothing to match")
+        raise InputError(f"the {name} volume is constant (every voxel is {low:g}): there is nothing to match; check the file")
 
 
 def require_known(volume: Volume, view: Box, name: str, every: int = 1) -> None:

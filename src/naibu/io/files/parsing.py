@@ -24,7 +24,7 @@ def parsed_toml(path: str | os.PathLike[str], content: bytes) -> dict[str, Any]:
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not UTF-8 text; save the file as UTF-8") from error
+        raise InputError(f"{path}: is not a TOML file: byte {error.start} is not UTF-8 text; give a text file in UTF-8") from error
     with guarded_reading(path, "TOML"):
         try:
             return tomllib.loads(text)
@@ -44,7 +44,9 @@ def read_json(path: Path) -> Any:
     with guarded_reading(path, "JSON"):
         try:
             return json.loads(content)
-        except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path}: is not JSON (byte {error.start} is no text)") from error
+        except json.JSONDecodeError as error:
             raise InputError(f"{path}: is not JSON ({error})") from error
 
 

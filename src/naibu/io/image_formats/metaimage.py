@@ -48,7 +48,7 @@ def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
     """Read vectors (nz, ny, nx, 3) and their grid, whose values are true where all components are finite."""
     header, values = _parts(path)
     if _channels(path.name, header) != 3 or values.ndim != 4:
-        raise InputError(f"{path.name}: contains no vectors of three components; use read_volume for scalar images")
+        raise InputError(f"{path.name}: holds no vectors of three components, hence no displacement; give a file of displacements")
     vectors = np.asarray(values, dtype=float)
     grid = _with_geometry(path, header, np.isfinite(vectors).all(axis=3), options)
     return vectors, grid

@@ -47,7 +47,7 @@ def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
     values, header = _loaded(path)
     spatial = _spatial_axes(path.name, header, values.ndim)
     if values.ndim != 4 or len(spatial) != 3 or values.shape[({0, 1, 2, 3} - set(spatial)).pop()] != 3:
-        raise InputError(f"{path.name}: contains no vectors of three components; use read_volume for scalar images")
+        raise InputError(f"{path.name}: holds no vectors of three components, hence no displacement; give a file of displacements")
     vectors = np.asarray(np.moveaxis(values, spatial, (2, 1, 0)), dtype=float)
     grid = _with_geometry(path, header, np.isfinite(vectors).all(axis=3), spatial, options)
     to_lps = _TO_LPS[str(header.get("space", "")).lower()]

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from naibu._version import __version__
-from naibu.core.arrays import IntArray, require_lengths
+from naibu.core.arrays import FloatArray, IntArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.experiment import Layer
 from naibu.core.progress import Progress, report_progress
@@ -201,7 +201,8 @@ def design(
     model = Zones.of(mesh, known=stated.values, known_sd=stated.doubts)
     young, poisson = np.array([sought[name] for name in model.names]).T
     truth = IdentifiedBody.stated(mesh, model, young, poisson, axes=inside.direction, law=law)
-    plans = list(product(_loads(pushes).items(), points, noise_mm))
+    loads = _loads(pushes, np.ptp(mesh.points, axis=0))
+    plans = list(product(loads.items(), points, noise_mm))
     rows: list[Planned] = []
     for done, ((push, cases), count, noise) in enumerate(plans, start=1):
         found = planned_identification(truth, model, cases, points=count, noise_mm=noise, plates_only=plates_only)
@@ -234,9 +235,12 @@ def _require_plans(points: Sequence[int], noise_mm: Sequence[float], pushes: Seq
             raise InputError(f"points must lie between {LEAST_POINTS} and {MOST_POINTS}, not {count}")
     for noise in noise_mm:
         require_lengths(noise_mm=noise)
+    for name, given in (("`pushes`", pushes), ("points", points), ("noise_mm", noise_mm)):
+        if not given:
+            raise InputError(f"nothing is planned without {name}; give at least one" + ", such as 'z+=0,0,-3'" * (given is pushes))
     plans = len(points) * len(noise_mm) * (len(pushes) + (len(pushes) > 1))
-    if not 1 <= plans <= MOST_PLANS:
-        raise InputError(f"pushes, points and noise_mm make {plans} plans; name at least one of each, and at most {MOST_PLANS} together")
+    if plans > MOST_PLANS:
+        raise InputError(f"`pushes`, points and noise_mm make {plans} plans; give fewer, for at most {MOST_PLANS} together")
 
 
 def _box(size_mm: tuple[float, float, float], layers: Sequence[Layer]) -> tuple[Volume, IntArray, dict[int, str]]:
@@ -247,9 +251,12 @@ def _box(size_mm: tuple[float, float, float], layers: Sequence[Layer]) -> tuple[
         raise InputError("a box needs `layers`, its materials from the base up, one of them known")
     ordered = sorted(layers, key=lambda layer: layer.from_base_mm)
     edges = [0.0, *(layer.to_base_mm for layer in ordered)]
-    gaps = [abs(layer.from_base_mm - edge) for layer, edge in zip(ordered, edges[:-1], strict=True)]
-    if max(gaps) > 1e-9 or abs(edges[-1] - size_mm[2]) > 1e-9:
-        raise InputError(f"layers must fill the height of the box, 0 to {size_mm[2]:g} mm, without gaps or overlaps")
+    for end, start in zip(edges, [*(layer.from_base_mm for layer in ordered), size_mm[2]], strict=True):
+        if abs(end - start) > 1e-9:
+            raise InputError(
+                f"layers must fill the height of the box, 0 to {size_mm[2]:g} mm: from {min(start, end):g} to {max(start, end):g} mm there "
+                + ("is none" if end < start else "is more than one, or it lies above the box")
+            )
     thinnest = min(np.diff(edges))
     edge = min(max(size_mm) / VOXELS, thinnest / 2.0)
     counts = [max(2, round(side / edge)) for side in size_mm]
@@ -279,13 +286,16 @@ def _expected(texts: Sequence[str], names: Sequence[str]) -> dict[str, tuple[flo
     return out
 
 
-def _loads(pushes: Sequence[str]) -> dict[str, dict[str, dict[str, tuple[float, float, float]]]]:
+def _loads(pushes: Sequence[str], extent_mm: FloatArray) -> dict[str, dict[str, dict[str, tuple[float, float, float]]]]:
     """Return load cases by plan: each push alone, and all of them together."""
     each: dict[str, dict[str, tuple[float, float, float]]] = {}
     for text in pushes:
         ((side, motion),) = parsed_sides((), [text], argument="pushes").items()
         if side not in SIDES:
             raise InputError(f"pushes={text!r}: side {side!r} is not known; use one of {', '.join(SIDES)}")
+        axis, inwards = "xyz".index(side[0]), -1.0 if side[1] == "+" else 1.0
+        if inwards * motion[axis] >= extent_mm[axis]:
+            raise InputError(f"pushes={text!r}: the object is {extent_mm[axis]:.4g} mm long along {side[0]}; push less far")
         opposite = side[0] + ("-" if side[1] == "+" else "+")
         each[text] = {side: motion, opposite: (0.0, 0.0, 0.0)}
     plans = {text: {text: moved} for text, moved in each.items()}

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
@@ -137,6 +139,7 @@ def simulate(
     if Workers(workers, cluster).elsewhere:
         raise InputError(f"`workers` and `cluster` share out the runs of a sweep, and {name} is one run; leave them out")
     if not of_elements:
+        _require_study(name)
         return simulate_lattice(
             study, out, resume=resume, overwrite=overwrite, checkpoint_every=checkpoint_every, device=device, progress=progress
         )
@@ -155,3 +158,17 @@ def simulate(
     files = simulate_study(name, out, overwrite=overwrite, progress=progress)
     count = sum(path.suffix == ".vtkhdf" for path in files)
     return SimulationRun(tuple(files), count, count)
+
+
+def _require_study(name: str) -> None:
+    """Refuse a name that is neither of a study nor of something on the disk, which is told when it is read."""
+    known = [study.name for study in named_studies()]
+    if name in known or Path(name).exists():
+        return
+    near = difflib.get_close_matches(name, known, n=1)
+    others = ", ".join(one for one in known if "-octree-" not in one)
+    raise InputError(
+        f"there is no study or file {name!r}; "
+        + (f"did you mean {near[0]!r}? Else " if near else "")
+        + f"give a file STUDY.toml, or one of {others}"
+    )
