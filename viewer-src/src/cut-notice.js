@@ -3,6 +3,8 @@ import { h } from "./elements.js";
 
 const LONG_MS = 700; // a step that takes no longer is not told of
 
+const PREPARING = "Cut (being prepared)"; // while kernels are compiled
+
 export class CutNotice {
   /** @param {string[]} stages what is computed before a cut opens, in order */
   constructor(stages) {
@@ -33,6 +35,17 @@ export class CutNotice {
     const text = frame.cutStage >= 0 ? `Cutting: ${this.stages[frame.cutStage]}…` : this.asked ? "Cutting…"
       : now - this.since > LONG_MS ? "Finding the balance of a step that takes long; the state before it is shown…" : "";
     this.#write(text, frame.cutStage);
+  }
+
+  /** Controls that conflict with a cut under way wait for it, and that of cuts also for their kernels, which the first run compiles. */
+  permit(frame, controls) {
+    controls.forEach((control) => {
+      const cuts = control.dataset.mode === "cut";
+      const waits = this.cutting || (frame.preparing && cuts);
+      if (control.disabled !== waits) control.disabled = waits;
+      const name = frame.preparing ? PREPARING : "Cut";
+      if (cuts && control.textContent !== name) control.textContent = name;
+    });
   }
 
   #write(text, stage = -1) {

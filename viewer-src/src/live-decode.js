@@ -1,5 +1,5 @@
 // The inverse of naibu/viewer/live/scene.py: the scene from JSON, frames from bytes.
-const FLAGS = { paused: 1, driving: 2, recording: 4, replaying: 8, failed: 16, held: 32, underWay: 64 };
+const FLAGS = { paused: 1, driving: 2, recording: 4, replaying: 8, failed: 16, held: 32, underWay: 64, preparing: 128 };
 const HEADER_BYTES = 112;
 
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;

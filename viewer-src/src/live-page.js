@@ -313,7 +313,7 @@ class LivePage {
     this.#markProbed();
     this.#badge(frame);
     this.notice.follow(frame, performance.now());
-    this.conflicting.forEach((control) => { if (control.disabled !== this.notice.cutting) control.disabled = this.notice.cutting; });
+    this.notice.permit(frame, this.conflicting);
     this.#write(frame, performance.now());
     this.stage.setAttribute("data-ready", "1");
   }

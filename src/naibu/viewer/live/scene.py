@@ -37,7 +37,7 @@ HEADER = np.dtype(
         ("cut_stage", "<i4"),
     ]
 )
-PAUSED, DRIVING, RECORDING, REPLAYING, FAILED, HELD, UNDER_WAY = 1, 2, 4, 8, 16, 32, 64
+PAUSED, DRIVING, RECORDING, REPLAYING, FAILED, HELD, UNDER_WAY, PREPARING = 1, 2, 4, 8, 16, 32, 64, 128
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,7 +174,8 @@ class LiveFrame:
     penetration_mm, steps_per_s, real_time : float
         How deep the surface lies in the tool; steps a second; simulated seconds a second.
     flags : int
-        Sum of `PAUSED`, `RECORDING`, `REPLAYING`, `FAILED`, `HELD` (the tool is held back), `UNDER_WAY` (a step takes longer than a frame).
+        Sum of `PAUSED`, `RECORDING`, `REPLAYING`, `FAILED`, `HELD` (the tool is held back), `UNDER_WAY` (a step takes longer than a frame),
+        `PREPARING` (kernels of cuts are being compiled: none can be made yet).
     strain : callable
         Returns the strain at the nodes (n,), computed when it is asked for.
     topology : int

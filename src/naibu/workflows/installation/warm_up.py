@@ -28,6 +28,9 @@ from naibu.mechanics.finite_elements.assembly import LARGE, Assembler
 from naibu.mechanics.finite_elements.elements import Formulation, elements
 from naibu.mechanics.finite_elements.hyperelasticity import LAWS, from_moduli
 from naibu.meshing.primitives import box
+from naibu.workflows.interactive.cut_kernels import compile_for_cuts
+from naibu.workflows.interactive.preparation import compile_for
+from naibu.workflows.interactive.touchable_models import touchable
 from naibu.workflows.markers.identify import identify
 from naibu.workflows.measurement.sense import sense
 from naibu.workflows.measurement.track import track
@@ -127,6 +130,7 @@ def _problems(folder: Path) -> dict[str, Callable[[], object]]:
         "predict": partial(predict, model, "ct_two_material_2", out=folder / "prediction"),
         "large meshes": _large_meshes,
         "chip": _chip,
+        "live": _live,
         "track": partial(_track, folder),
         "track-sequence": partial(_track_sequence, folder),
     }
@@ -159,6 +163,13 @@ def _large_meshes() -> None:
 def _chip() -> None:
     """Solve the beams of a sensing chip, and read their piezoresistors."""
     sensitivity_matrix(solve_chip(assumed_chip(), ChipResolution(along=2, across=1, through=1), whole=False))
+
+
+def _live() -> None:
+    """Touch what `naibu live` shows without an argument, and cut a small body, with and without friction of the sides."""
+    compile_for(touchable("demo").body)
+    for friction in (0.0, 0.4):
+        compile_for_cuts(friction)
 
 
 def _write_texture(reference: Path, deformed: Path) -> None:

@@ -26,10 +26,11 @@ from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulati
 from naibu.simulation.real_time_loop import RealTimeLoop
 from naibu.simulation.tool_places import placed
 from naibu.viewer.live.commands import LiveCommand
-from naibu.viewer.live.scene import FAILED, HELD, PAUSED, RECORDING, REPLAYING, UNDER_WAY, LiveFrame, LiveScene
+from naibu.viewer.live.scene import FAILED, HELD, PAUSED, PREPARING, RECORDING, REPLAYING, UNDER_WAY, LiveFrame, LiveScene
 from naibu.viewer.live.server import LiveServer, bound_port, serve
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.workflows.applications.fingertip_study import FINGERTIP, describes_fingertip
+from naibu.workflows.interactive.cut_kernels import CutKernels
 from naibu.workflows.interactive.haptics.endpoint import HapticEndpoint
 from naibu.workflows.interactive.preparation import compile_for, settle, waiting_device
 from naibu.workflows.interactive.touchable_fingertip import touchable_fingertip
@@ -48,6 +49,7 @@ class LiveSimulation:
 
     model: TouchableModel
     loop: RealTimeLoop
+    cut_kernels: CutKernels | None = None
     _scene: LiveScene | None = None
 
     @property
@@ -82,7 +84,7 @@ class LiveSimulation:
         """Return the last frame."""
         frame, pace = self.loop.latest()
         flags = PAUSED * pace.paused | RECORDING * pace.recording | REPLAYING * pace.replaying | FAILED * bool(frame.failed)
-        flags |= HELD * frame.held | UNDER_WAY * frame.under_way
+        flags |= HELD * frame.held | UNDER_WAY * frame.under_way | PREPARING * self._preparing
         tool = list(self.loop.simulation.tools).index(frame.tool) if frame.tool else -1
         return LiveFrame(
             frame.number, frame.time_s, frame.positions, tool, frame.gripped, frame.tool_centre, frame.force, frame.pull,
@@ -92,10 +94,16 @@ class LiveSimulation:
             np.zeros((0, 3)) if self.model.sensor is None else self.model.sensor.at(frame),
         )  # fmt: skip
 
+    @property
+    def _preparing(self) -> bool:
+        return self.cut_kernels is not None and not self.cut_kernels.ready
+
     def command(self, command: LiveCommand) -> None:
         """Carry out a command of the page that drives."""
         loop = self.loop
         match command.kind:
+            case "cut" if self._preparing:
+                loop.submit(_refuse_cut)
             case "pause":
                 loop.pause(command.switch)
             case "record":
@@ -196,8 +204,11 @@ def live(
                 preparing()
             model = _rubbing(_touchable(source, experiment, material, decoder), lips_friction)
             simulation = _prepared(model, hand)
+            kernels = _cut_kernels(model, lips_friction)
+            if kernels is not None and hand is not None:
+                kernels.wait()  # a device feels what takes the interpreter from its thread
         with _stepped(simulation, hand) as loop:
-            serve(LiveServer(LiveSimulation(model, loop)), bound, ready)
+            serve(LiveServer(LiveSimulation(model, loop, kernels)), bound, ready)
 
 
 def _touchable(
@@ -221,6 +232,11 @@ def _rubbing(model: TouchableModel, friction: float) -> TouchableModel:
     if not (model.cuttable and isinstance(model.body, FiniteElementBody)):
         raise InputError(f"lips_friction must be 0, not {friction:g}: this is no body of finite elements that can be cut")
     return replace(model, body=replace(model.body, lips_friction=friction))
+
+
+def _cut_kernels(model: TouchableModel, lips_friction: float) -> CutKernels | None:
+    """Begin to compile what cuts of a model need; None where there is nothing to compile."""
+    return CutKernels(lips_friction) if model.cuttable and isinstance(model.body, FiniteElementBody) else None
 
 
 @contextmanager
@@ -284,6 +300,10 @@ def _stepped(simulation: InteractiveSimulation, hand: HapticHand | None) -> Iter
 def _single(body: InteractiveBody, hand: HapticHand | None) -> bool:
     """Whether frames are single steps of the body, which are short enough to be felt."""
     return hand is not None and body.step_s <= LONGEST_STEP_S
+
+
+def _refuse_cut(_: InteractiveSimulation) -> None:
+    raise InputError("kernels of cuts are still being compiled, which the first run does; cut when that is done")
 
 
 def _order(kind: str, command: LiveCommand, model: TouchableModel) -> Callable[[InteractiveSimulation], None]:
