@@ -229,8 +229,8 @@ def _section(times: FloatArray, found: DecodedForces, offsets: FloatArray) -> Se
     ok = found.answered
     text = (
         f"{int(ok.sum())} of {len(ok)} readings are answered; in the others {UNANSWERED}. Intervals hold 95 %. The decoder supposes a "
-        "contact that presses towards the centre of the hemisphere; sideways drag is taken for another direction. An azimuth is shown where the "
-        "tilt's interval excludes 0.",
+        "contact that presses towards the centre of the hemisphere; sideways drag is taken for another direction. An azimuth is shown "
+        "where the tilt's interval excludes 0.",
     )
     summary = Table("Summary", ("quantity", "value"), _summary(found))
     drift = Table(
