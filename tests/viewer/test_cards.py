@@ -22,6 +22,7 @@ def test_a_parameter_shows_its_interval_or_why_there_is_none() -> None:
         ParameterRow("g: nu", "gel: Poisson's ratio", 0.49, 0.47, math.inf, ""),
         ParameterRow("f", "friction", 0.3, -math.inf, math.inf, ""),
         ParameterRow("h: E", "hard: Young's modulus", 200.0, 200.0, 200.0, "kPa", "given"),
+        ParameterRow("h: c", "hard: C20 / C10", 0.6, -0.002, 1.1, ""),
     ]
     shown = [(card.value, card.detail) for card in parameter_cards(rows)]
     assert shown == [
@@ -29,4 +30,5 @@ def test_a_parameter_shows_its_interval_or_why_there_is_none() -> None:
         ("0.490", "95 %: above 0.470"),
         ("0.300", "not bounded by the data"),
         ("200 kPa", "given"),
+        ("0.6", "95 %: 0.0 to 1.1"),
     ]

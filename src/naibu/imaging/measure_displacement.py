@@ -34,7 +34,7 @@ from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
 from naibu.imaging.preprocessing.object_mask import LeftOut, left_out, mask_in_view, mask_jumps
 from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_grid
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
-from naibu.imaging.preprocessing.volume_pair import require_known
+from naibu.imaging.preprocessing.volume_pair import require_known, require_one_grid
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts, doubt_beside
 from naibu.imaging.volume_correlation.results.block_displacements import LEFT
@@ -149,11 +149,7 @@ def measure_displacement(
     """
     if method not in METHODS:
         raise InputError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
-    if different := reference.grid_difference(deformed):
-        raise InputError(
-            f"reference and deformed lie on different grids: {different}; resample one to the grid of the other with "
-            "naibu.imaging.resampled_to_grid"
-        )
+    require_one_grid(reference, deformed)
     if method != "default":
         _require_measured(reference, deformed)
     views = fields_of_view(reference, deformed)

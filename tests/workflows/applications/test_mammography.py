@@ -86,7 +86,7 @@ def test_outlines_under_neutral_names_that_may_be_swapped_are_told(tmp_path: Pat
         ({"cc": "image.png"}, "pixel_mm is missing"),
         ({"cc": "image.png", "pixel_mm": 0.5}, "image.png"),
         ({"cc": None}, "cc is missing"),
-        ({"cc": None, "mlo": None}, "cc and mlo are missing"),
+        ({"cc": None, "mlo": None}, "`cc` and `mlo` are missing"),
         ({"angle_deg": None}, "angle_deg is missing"),
         ({"thickness_mm": None}, "thickness_mm is missing"),
         ({"model": "other"}, "model is 'other'"),

@@ -200,6 +200,16 @@ def test_readings_in_millivolts_are_told_by_the_training_of_the_decoder(folder: 
         decode_forces(out / "my_finger-decoder.json", tmp_path / "1000.csv", out=tmp_path / "more")
 
 
+def test_a_record_in_which_nothing_touches_shows_no_empty_axes(folder: Path, tmp_path: Path) -> None:
+    """The page drew axes without a curve, a table without a row, and said that every reading lay beyond the training."""
+    np.savetxt(tmp_path / "free.csv", np.column_stack([0.01 * np.arange(60), np.zeros((60, 3))]), delimiter=",")
+    run = decode_forces(folder / "out" / "my_finger-decoder.json", tmp_path / "free.csv", out=tmp_path / "forces", friction=0.5)
+    (said,) = (value for name, value in run.rows if name == "readings answered")
+    assert said.startswith("0 of 60: nothing touches")
+    page = (tmp_path / "forces" / "forces.html").read_text(encoding="utf-8")
+    assert "<figure" not in page and "No contact was found" in page
+
+
 def test_a_checkpoint_of_another_study_is_refused(folder: Path, tmp_path: Path) -> None:
     study = written(tmp_path)
     with pytest.raises(InputError, match="nothing to resume"):

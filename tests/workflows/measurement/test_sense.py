@@ -193,8 +193,25 @@ def test_methods_that_all_fail_say_why(folder: Path, tmp_path: Path) -> None:
         compare_methods(read_pair(tiny, tiny), ["features", "features"], out=tmp_path / "out")
 
 
+def test_scans_that_no_method_can_compare_are_told_once(folder: Path, tmp_path: Path) -> None:
+    """Every method said the same sentence."""
+    said: list[str] = []
+    values = np.random.default_rng(0).random((6, 7, 8))
+    for name, other in (("spacing", 10.0), ("same", 1.0)):
+        scans = [
+            write_volume(tmp_path / f"{name}{k}.mha", Volume.from_array(v, spacing_mm=3 * [s]))
+            for k, (v, s) in enumerate(((values, 1.0), (values if other > 1.0 else 0.0 * values, other)))
+        ]
+        with pytest.raises(InputError, match=r"other units\?" if other > 1.0 else "constant"):
+            compare_methods(read_pair(*scans), ["rigid", "features"], out=tmp_path / "out", told=said.append)
+    assert not said and not (tmp_path / "out").exists()
+
+
 def test_scans_on_different_grids_are_refused(folder: Path) -> None:
     before, after, *_ = squeezed_ball(seed=3)
+    tenfold = Volume.from_array(after.values, spacing_mm=10.0 * np.array([1.5, 1.5, 2.0]))
+    with pytest.raises(InputError, match=r"other units\?"):
+        measure_displacement(before, tenfold)
     other = Volume.from_array(after.values, spacing_mm=(1.5, 1.5, 1.9))
     with pytest.raises(InputError, match=r"different grids: their voxel spacings differ: \[1\.5, 1\.5, 2\.0\] and"):
         measure_displacement(before, other)

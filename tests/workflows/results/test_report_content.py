@@ -24,7 +24,8 @@ from naibu.workflows.results.report_content import parameter_label, parameter_ro
         ("soft: poisson_ratio", "soft: Poisson's ratio"),
         ("soft on table: friction", "soft on table: friction"),
         ("cube/deformed: height", "cube/deformed: height"),
-        ("my_gel: c01_fraction", "my_gel: c01 fraction"),
+        ("my_gel: c01_fraction", "my_gel: C01 / (C10 + C01)"),
+        ("my_gel: c20_ratio", "my_gel: C20 / C10"),
         ("young_modulus", "Young's modulus"),
     ],
 )

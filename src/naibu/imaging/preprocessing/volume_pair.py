@@ -28,13 +28,7 @@ def intensity_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, F
     InputError
         Grids that differ, a volume without contrast, infinite values, or no voxel that is known in both.
     """
-    if different := reference.grid_difference(deformed):
-        ratio = deformed.spacing_mm / reference.spacing_mm
-        units = " Their spacings differ by a power of ten: was one stored in other units?" if _power_of_ten(ratio) else ""
-        raise InputError(
-            f"reference and deformed lie on different grids: {different}; resample deformed to the grid of the reference with "
-            f"naibu.imaging.resampled_to_grid.{units}"
-        )
+    require_one_grid(reference, deformed)
     known = np.isfinite(reference.values)
     if not (known & np.isfinite(deformed.values)).any():
         raise InputError("reference and deformed do not overlap: no voxel is known in both; check the transform that registered them")
@@ -48,6 +42,23 @@ def intensity_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, F
                 f"the {name} volume has no contrast left; repair damaged voxels"
             )
     return a, b
+
+
+def require_one_grid(reference: Volume, deformed: Volume) -> None:
+    """Refuse volumes on different grids; spacings that differ by a power of ten are told as what they are likely to be.
+
+    Raises
+    ------
+    InputError
+        Such volumes.
+    """
+    if different := reference.grid_difference(deformed):
+        ratio = deformed.spacing_mm / reference.spacing_mm
+        units = " Their spacings differ by a power of ten: was one stored in other units?" if _power_of_ten(ratio) else ""
+        raise InputError(
+            f"reference and deformed lie on different grids: {different}; resample one to the grid of the other (in Python by "
+            f"naibu.imaging.resampled_to_grid).{units}"
+        )
 
 
 def require_contrast(volume: Volume, name: str) -> None:

@@ -165,9 +165,11 @@ def load_decoder(path: Path) -> StoredDecoder:
     try:
         data = json.loads(read_bytes(path).decode("utf-8"))
     except (UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise InputError(f"{path}: is no decoder of a fingertip ({error}); give the NAME-decoder.json that `simulate` writes") from error
+        raise InputError(
+            f"{path}: is no decoder of a fingertip ({error}); give the NAME-decoder.json that 'naibu simulate' writes"
+        ) from error
     if not isinstance(data, dict) or data.get("kind") != DECODER:
-        raise InputError(f"{path}: is no decoder of a fingertip; give the NAME-decoder.json that `simulate` writes")
+        raise InputError(f"{path}: is no decoder of a fingertip; give the NAME-decoder.json that 'naibu simulate' writes")
     try:
         stored = StoredDecoder.model_validate(data)
     except ValidationError as error:

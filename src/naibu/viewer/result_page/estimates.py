@@ -106,7 +106,7 @@ def _to_width(value: float, width: float) -> str:
     if not (math.isfinite(value) and math.isfinite(width) and width > 0) or not 1e-3 <= abs(value) < 1e5:
         return cell_text(value)
     digits = min(6, max(0, 1 - math.floor(math.log10(width))))
-    return f"{value:.{digits}f}".replace("-", "−")
+    return f"{round(value, digits) + 0.0:.{digits}f}".replace("-", "−")  # a zero has no sign
 
 
 def _interval(row: ParameterRow, scale: _Scale) -> str:

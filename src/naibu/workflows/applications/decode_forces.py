@@ -28,6 +28,7 @@ from naibu.workflows.applications.stored_decoder import stored_detector
 from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 MOST_VOLTS = 100.0  # several times what amplifiers give
+UNANSWERED = "nothing touches, or force or tilt lie beyond the training"
 FAR_BEYOND = 10.0  # times the largest reading of the training, from which a table is in another unit, or another fingertip's
 
 if TYPE_CHECKING:
@@ -175,7 +176,7 @@ def _csv(times: FloatArray, found: DecodedForces, sideways: SidewaysForces, fric
 def _summary(found: DecodedForces) -> tuple[tuple[str, str], ...]:
     ok = found.answered
     if not ok.any():
-        return (("readings answered", f"0 of {len(ok)}: all lie beyond the training"),)
+        return (("readings answered", f"0 of {len(ok)}: {UNANSWERED}"),)
     top = int(np.nanargmax(found.force_mn))
     low, high = 1e-3 * found.force_95[top]
     return (
@@ -188,7 +189,7 @@ def _summary(found: DecodedForces) -> tuple[tuple[str, str], ...]:
 
 def _cards(found: DecodedForces) -> tuple[Card, ...]:
     ok = found.answered
-    answered = Card("Readings answered", f"{np.mean(ok):.0%}", f"{int(ok.sum())} of {len(ok)}; the others lie beyond the training")
+    answered = Card("Readings answered", f"{100.0 * np.mean(ok):.0f} %", f"{int(ok.sum())} of {len(ok)}; in the others {UNANSWERED}")
     if not ok.any():
         return (answered,)
     top = int(np.nanargmax(found.force_mn))
@@ -227,9 +228,9 @@ def _section(times: FloatArray, found: DecodedForces, offsets: FloatArray) -> Se
 
     ok = found.answered
     text = (
-        f"{int(ok.sum())} of {len(ok)} readings are answered; the others lie beyond the forces and tilts of the training, or nothing "
-        "touches. Intervals hold 95 %. The decoder supposes a contact that presses towards the centre of the hemisphere; sideways drag is "
-        "taken for another direction. An azimuth is shown where the tilt's interval excludes 0.",
+        f"{int(ok.sum())} of {len(ok)} readings are answered; in the others {UNANSWERED}. Intervals hold 95 %. The decoder supposes a "
+        "contact that presses towards the centre of the hemisphere; sideways drag is taken for another direction. An azimuth is shown "
+        "where the tilt's interval excludes 0.",
     )
     summary = Table("Summary", ("quantity", "value"), _summary(found))
     drift = Table(
@@ -237,9 +238,5 @@ def _section(times: FloatArray, found: DecodedForces, offsets: FloatArray) -> Se
         tuple((n, float(a), float(b)) for n, a, b in zip(("F_z", "M_x", "M_y"), offsets[0], offsets[-1], strict=True)),
         note="Recalibrated while nothing touches; a drift under a load cannot be told from the load.",
     )  # fmt: skip
-    return Section(
-        "Forces",
-        text,
-        (summary, drift),
-        (Figure("Forces", f"With 95 % intervals; {len(drawn_rows(len(times)))} of {len(times)} readings.", draw, (11.0, 3.4)),),
-    )
+    caption = f"With 95 % intervals; {len(drawn_rows(len(times)))} of {len(times)} readings."
+    return Section("Forces", text, (summary, drift), (Figure("Forces", caption, draw, (11.0, 3.4)),) if ok.any() else ())

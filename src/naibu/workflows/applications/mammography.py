@@ -166,7 +166,7 @@ def relate_views(
         pair = pair_of_shape(scan.shape, plates, angle, outlines=outlines, constrain_outlines=constrain_outlines, **common)
     else:
         if views is None:  # refused above
-            raise InputError("cc and mlo are missing: give both views, or the mask of a scan")
+            raise InputError("`cc` and `mlo` are missing: give both views, or the mask of a scan")
         pair = mammographic_pair(views[0].outline, views[1].outline, plates, angle, **common)
     found = _found(pair, (point_cc, point_mlo), None if scan is None else _scanned_point(scan, point_mr))
     untold = views is not None and any(view.mammogram is None for view in views)  # no tag says which view a file shows
@@ -217,7 +217,7 @@ def _require_points(cc: object, mlo: object, mr: object, points: tuple[object, o
     if (cc is None) != (mlo is None):
         raise InputError(f"{'cc' if cc is None else 'mlo'} is missing: give both views")
     if cc is None and mr is None:
-        raise InputError("cc and mlo are missing: give both views, or the mask of a scan")
+        raise InputError("`cc` and `mlo` are missing: give both views, or the mask of a scan")
     if all(point is None for point in points):
         raise InputError("point_cc is missing: give a point in CC, in MLO, in both, or in a scan")
     if points[2] is not None and mr is None:
@@ -339,7 +339,7 @@ def _sections(found: _Found, warnings: list[str], model: str, uncertainty: Model
     lesion = found.scanned if found.lesion is None else found.lesion.position
     breast = Figure(
         "Unloaded breast",
-        "From the front and from the side, with the points that the curve stands for.",
+        "From the front, from above and from the side, with the points that the curve stands for.",
         lambda canvas: draw_breast(canvas, found.pair.nominal.shape, curve, lesion),
         (9.0, 4.0),
     )

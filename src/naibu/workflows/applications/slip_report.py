@@ -56,6 +56,8 @@ def slip_summary(times: FloatArray, sideways: SidewaysForces, friction: float | 
 
 def slip_section(times: FloatArray, sideways: SidewaysForces, friction: float | None, touch_s: float) -> Section:
     """Return the section on drag and slip: one row a contact, and T / F over time."""
+    if not sideways.contact.any():
+        return Section("Drag and slip", ("No contact was found in the record.",))
     contacts = tuple(_contact(times, sideways, k, friction) for k in range(1, int(sideways.contact.max(initial=0)) + 1))
     columns = (
         "contact",

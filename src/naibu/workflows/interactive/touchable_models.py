@@ -177,7 +177,7 @@ def touchable(source: str | os.PathLike[str], *, experiment: Source | None = Non
         )
     raise InputError(
         f"{source}: is neither a {MODEL_FILE} or its folder, nor a mesh ({', '.join(MESH_READERS)}), nor a study (.toml); what naibu "
-        f"brings with it is demo (the gels of naibu demo) and the lattices {', '.join(NAMED)}"
+        f"brings with it is demo (the gels of naibu demo), for naibu live fingertip, and the lattices {', '.join(NAMED)}"
     )
 
 

@@ -16,6 +16,7 @@ from naibu.core.progress import Progress, ProgressReport, report_progress
 from naibu.imaging.displacement.accuracy import end_point_error
 from naibu.imaging.measure_displacement import Method
 from naibu.imaging.preprocessing.resampling import warped
+from naibu.imaging.preprocessing.volume_pair import require_contrast, require_one_grid
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.chapters.chapter_page import write_chapter
 from naibu.viewer.tables import Cell, Table
@@ -74,6 +75,9 @@ def compare_methods(
     InputError
         A folder that cannot be written to, or no method that could be used.
     """
+    require_one_grid(pair.reference, pair.deformed)  # told once, not by every method
+    for volume, name in ((pair.reference, "reference"), (pair.deformed, "deformed")):
+        require_contrast(volume, name)
     folder = output_folder(out, ("methods.html", "methods.json"), overwrite=overwrite)
     runs: dict[Method, SenseRun] = {}
     failures: dict[Method, str] = {}

@@ -295,13 +295,13 @@ def _quality(motion: ParticleMotion) -> Figure:
     def draw(canvas: Canvas) -> None:
         left, right = canvas.subplots(1, 2)
         left.hist(confidence, bins=np.linspace(0.0, 1.0, 41), color="#2a788e")
-        left.set(xlabel="probability that the link is right", ylabel="links", yscale="log")
+        left.set(xlabel="probability that the link is right", ylabel="links", yscale="log", ylim=(0.5, None))
         edges = np.linspace(at.min(), at.max(), 13)
         bins = np.clip(np.digitize(at, edges) - 1, 0, 11)
         for k, colour in zip(range(last + 1), ("#440154", "#2a788e", "#d95f02"), strict=False):
             middles = [(0.5 * (edges[i] + edges[i + 1]), float(np.median(sd[bins == i, k]))) for i in range(12) if (bins == i).any()]
             right.plot(*zip(*middles, strict=True), "o-", ms=3, color=colour, label=f"along {'xyz'[k]}")
-        right.set(xlabel=f"{'xyz'[last]}, mm", ylabel="SD of the displacement, mm", ylim=(0.0, None))
+        right.set(xlabel=f"{'xyz'[last]}, mm", ylabel="SD of the displacement, mm", ylim=(0.0, 1.1 * right.dataLim.y1))
         right.legend(frameon=False)
 
     caption = "Confidence of the links, and standard deviation of the displacement from place to place (medians)."

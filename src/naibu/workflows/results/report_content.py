@@ -29,7 +29,13 @@ _ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D
 INCOMPRESSIBLE, NOT_VERY_COMPRESSIBLE = 0.499, 0.3  # Poisson's ratios
 BY_LAW = 1.5  # times its standard deviation: a modulus that is so much less certain if the law is not taken for right
 WEAK = 0.6  # of the width of the prior: an interval as wide as that owes little to the data
-LABELS: Mapping[str, str] = {"young_modulus": "Young's modulus", "poisson_ratio": "Poisson's ratio"}
+LABELS: Mapping[str, str] = {
+    "young_modulus": "Young's modulus",
+    "poisson_ratio": "Poisson's ratio",
+    "c01_fraction": "C01 / (C10 + C01)",
+    "c20_ratio": "C20 / C10",
+    "c30_ratio": "C30 / C10",
+}
 
 
 @dataclass(frozen=True, slots=True)
