@@ -184,7 +184,7 @@ def _tool(distance_mm: float, reach_mm: float, refined: bool) -> ToolArrays:
     tool = ToolArrays(
         np.zeros((ROOM, 3)), np.zeros(ROOM), np.zeros((ROOM, 3)), whole(ROOM), whole(ROOM), np.zeros((ROOM, 3)), whole(ROOM),
         whole(ROOM, 2),
-        whole(QUEUE), whole(MOST_AROUND), numbers, real,
+        whole(QUEUE), whole(MOST_AROUND), numbers, real, np.zeros((walk.ROWS, 3)),
     )  # fmt: skip
     _put_down(tool)
     return tool
