@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -11,7 +11,7 @@ import pytest
 
 from naibu._numba.compilation import njit
 from naibu._numba.intrinsics import _packed_type, packed_tuples
-from naibu._numba.intrinsics.packed_tuples import packed
+from naibu._numba.intrinsics.packed_tuples import packed, packed_items
 
 
 @njit
@@ -50,6 +50,34 @@ def test_packed_tuples_are_what_tuples_are() -> None:
     assert not np.array_equal(given[0][0][1], arguments()[0][0][1])
 
 
+class _Named(NamedTuple):
+    values: Any
+    factor: float
+
+
+@njit
+def _named_kernel(data: Any, inner: Any) -> Any:
+    values, factor = data
+    inner.nested.values[0] += data.factor * data.values[1]
+    return values[2] * factor + inner.nested.factor + len(inner.nested)
+
+
+def test_named_items_are_read_by_their_names() -> None:
+    class Outer(NamedTuple):
+        other: int
+        nested: _Named
+
+    plain, given = (
+        (_Named(np.arange(3.0), 2.0), Outer(1, _Named(np.ones(1), 0.5))),
+        (_Named(np.arange(3.0), 2.0), Outer(1, _Named(np.ones(1), 0.5))),
+    )
+    assert _named_kernel(*map(packed_items, given)) == _named_kernel(*plain) == 6.5
+    assert given[1].nested.values[0] == plain[1].nested.values[0] == 3.0
+    assert packed_items(given[0]).kind != packed(*given[0]).kind
+    with pytest.raises(numba.TypingError, match="nothing"):
+        njit(lambda data: data.nothing)(packed_items(given[0]))
+
+
 def test_arrays_stay_alive_and_may_change_between_calls() -> None:
     given = packed(*arguments())
     values = given.kept[2]
@@ -72,7 +100,7 @@ def test_types_are_told_apart_as_numba_does() -> None:
     fixed.setflags(write=False)
     told = [fixed, np.zeros((2, 3)), np.zeros(2), np.zeros((2, 3), np.int32), 1.0, np.float32(1.0), 2, 2**63, True, (np.zeros(2), 1)]
     for one in told:
-        assert packed(one).kind == packed(one).kind == numba.typeof(_packed_type.packed(one))
+        assert packed(one).kind == packed(one).kind == numba.typeof(_packed_type.packed((one,)))
     assert len({packed(one).kind for one in told}) == len(told)
 
 

@@ -8,13 +8,14 @@ import hashlib
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
-from numba.extending import NativeValue, lower_builtin, models, register_model, typeof_impl, unbox
+from numba.core.typing.templates import AttributeTemplate
+from numba.extending import NativeValue, infer_getattr, lower_builtin, lower_getattr_generic, models, register_model, typeof_impl, unbox
 from numba.np import numpy_support
 from numba.np.arrayobj import populate_array
 
@@ -31,19 +32,21 @@ class PackedTuple(types.BaseTuple):
     ----------
     items : tuple of numba type
         Of contiguous arrays, numbers and packed tuples.
+    fields : tuple of str
+        Names of the items, where they have names.
     """
 
-    def __init__(self, items: tuple[Any, ...]) -> None:
-        self.types, self.count = items, len(items)
+    def __init__(self, items: tuple[Any, ...], fields: tuple[str, ...] = ()) -> None:
+        self.types, self.count, self.fields = items, len(items), fields
         self.starts = [0]
         for one in items:
             self.starts.append(self.starts[-1] + _places(one))
-        super().__init__(name=f"packed_{hashlib.sha256(_SOURCE + repr(items).encode()).hexdigest()[:16]}")
+        super().__init__(name=f"packed_{hashlib.sha256(_SOURCE + repr((fields, items)).encode()).hexdigest()[:16]}")
 
     @property
     def key(self) -> tuple[Any, ...]:
-        """Packed tuples are equal where the types of their items are."""
-        return self.types
+        """Packed tuples are equal where the types and names of their items are."""
+        return self.types, self.fields
 
     def __getitem__(self, index: Any) -> Any:
         """Return the type of an item."""
@@ -75,8 +78,8 @@ def _class_of(kind: PackedTuple) -> type[Packed]:
     return type("Packed", (Packed,), {"kind": kind})
 
 
-def packed(*items: Any) -> Packed:
-    """Return arguments in memory; see `naibu._numba.intrinsics.packed_tuples.packed`."""
+def packed(items: tuple[Any, ...]) -> Packed:
+    """Return arguments in memory; see `naibu._numba.intrinsics.packed_tuples`."""
     kind = _type_of(items)
     memory = np.zeros(max(kind.starts[-1], 1), dtype=np.int64)
     _fill(memory, kind, items)
@@ -98,7 +101,7 @@ def _type_of(items: tuple[Any, ...]) -> PackedTuple:
         if isinstance(kind, types.Array) and kind.layout != "C":
             raise ValueError(f"arrays in packed tuples must be contiguous; one has the shape {one.shape} and the strides {one.strides}")
         found.append(kind)
-    return PackedTuple(tuple(found))
+    return PackedTuple(tuple(found), getattr(items, "_fields", ()))
 
 
 def _fill(memory: Any, kind: PackedTuple, items: tuple[Any, ...]) -> None:
@@ -158,6 +161,22 @@ def _item(context: Any, builder: Any, kind: PackedTuple, memory: Any, index: int
     return array._getvalue()
 
 
+@infer_getattr
+class _NamedItem(AttributeTemplate):
+    """What tells the type of an item that is read by its name."""
+
+    key = PackedTuple
+
+    def generic_resolve(self, kind: PackedTuple, name: str) -> Any:
+        """Return the type of an item; None where none has this name."""
+        return kind.types[kind.fields.index(name)] if name in kind.fields else None
+
+
+@lower_getattr_generic(PackedTuple)
+def _named_item(context, builder, kind, memory, name):  # type: ignore[no-untyped-def]
+    return _item(context, builder, kind, memory, kind.fields.index(name))
+
+
 @lower_builtin("static_getitem", PackedTuple, types.IntegerLiteral)
 def _static_item(context, builder, sig, args):  # type: ignore[no-untyped-def]
     kind, (memory, index) = sig.args[0], args
@@ -171,13 +190,18 @@ def _static_slice(context, builder, sig, args):  # type: ignore[no-untyped-def]
     return context.make_tuple(builder, sig.return_type, items)
 
 
+class _Trial(NamedTuple):
+    scale: float
+    matrix: Any
+
+
 def trial() -> bool:
     """Tell whether a kernel that takes a packed tuple apart compiles and is right."""
 
     def kernel(data: Any) -> Any:
         x, (scale, matrix), known = data
-        x[0] += scale * matrix[1, 2] * len(data[1]) if known else 0.0
+        x[0] += scale * data[1].matrix[1, 2] * len(data[1]) * matrix.ndim / 2 if known else 0.0
         return x[0] + len(x)
 
     x, matrix = np.zeros(3), np.arange(6, dtype=np.float32).reshape(2, 3)
-    return bool(numba.njit(kernel)(packed(x, (0.5, matrix), True)) == 8.0 and x[0] == 5.0)
+    return bool(numba.njit(kernel)(packed((x, _Trial(0.5, matrix), True))) == 8.0 and x[0] == 5.0)

@@ -37,11 +37,22 @@ def packed(*items: Any) -> Any:
     ValueError
         An array that is not contiguous.
     """
+    return packed_items(items)
+
+
+def packed_items(items: Any) -> Any:
+    """Return a tuple, named or not, as one argument of a kernel, which reads named items by their names, too; see `packed`.
+
+    Parameters
+    ----------
+    items : tuple or named tuple
+        Of arrays, numbers and such tuples.
+    """
     if not PACKED:
         return items
     kind = _of_kind(items)
     if kind not in _CLASSES:
-        _CLASSES[kind] = type(_packed_type.packed(*items))
+        _CLASSES[kind] = type(_packed_type.packed(items))
     own = _CLASSES[kind]
     memory = np.zeros(max(own.kind.starts[-1], 1), dtype=np.int64)
     _packed_type._fill(memory, own.kind, items)
@@ -52,7 +63,7 @@ def packed(*items: Any) -> Any:
 
 def _of_kind(items: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return what the type of a packed tuple depends on; Numba takes milliseconds to find and to compare types of a hundred arrays."""
-    found: list[Any] = []
+    found: list[Any] = [getattr(items, "_fields", ())]
     for one in items:
         if type(one) is np.ndarray:
             flags = one.flags

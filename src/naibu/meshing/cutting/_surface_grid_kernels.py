@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.meshing.cutting._surface_search_kernels import nearest_on_triangle
 
@@ -23,14 +23,14 @@ class GridArrays(NamedTuple):
     listed: IntArray
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _between(low, size, shape, axis, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
     """First and last cell along an axis between two coordinates."""
     first, last = int(np.floor((a - low[axis]) / size)), int(np.floor((b - low[axis]) / size))
     return min(max(first, 0), shape[axis] - 1), min(max(last, 0), shape[axis] - 1)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _list(p, triangles, low, size, shape, count, listed, filled):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Count the triangles of each cell, or list them where `filled`; returns how many places they take."""
     total = 0
@@ -68,7 +68,7 @@ def grid_of(points: FloatArray, triangles: IntArray, size_mm: float) -> GridArra
     return GridArrays(low, np.array([size]), shape, start, listed)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def nearest_listed(s, grid, qx, qy, qz, reach):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the triangle nearest to q among the parts of those listed within reach; -1 where none is so near."""
     best, where, low, size, shape = reach * reach, -1, grid.low, grid.size[0], grid.shape

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 from naibu.core.arrays import FloatArray, IntArray
 
 MOST_AROUND = 512  # triangles at a vertex
@@ -34,13 +34,26 @@ class SurfaceArrays(NamedTuple):
     n: IntArray  # (5,) numbers of vertices and triangles, last stamp, numbers of edges and of touched triangles
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _length2(p, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
     x, y, z = p[a, 0] - p[b, 0], p[a, 1] - p[b, 1], p[a, 2] - p[b, 2]
     return x * x + y * y + z * z
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
+def _cross(p, o, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Vector product of the ways from o to a and to b."""
+    ax, ay, az = p[a, 0] - p[o, 0], p[a, 1] - p[o, 1], p[a, 2] - p[o, 2]
+    bx, by, bz = p[b, 0] - p[o, 0], p[b, 1] - p[o, 1], p[b, 2] - p[o, 2]
+    return ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+
+
+@njit(cache=True, **UNCOUNTED)
+def _product(u, v):  # type: ignore[no-untyped-def]  # pragma: no cover
+    return u[0] * v[0] + u[1] * v[1] + u[2] * v[2]
+
+
+@njit(cache=True, **UNCOUNTED)
 def longest(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Corner opposite to the longest edge at rest; equal ones are told apart by their vertices."""
     best, where, low, high = -1.0, 0, 0, 0
@@ -53,7 +66,7 @@ def longest(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
     return where
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _replace(s, t, old, new):  # type: ignore[no-untyped-def]  # pragma: no cover
     if t >= 0:
         for i in range(3):
@@ -62,27 +75,27 @@ def _replace(s, t, old, new):  # type: ignore[no-untyped-def]  # pragma: no cove
                 return
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def corner(s, t, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return which corner of a triangle a vertex is."""
     return 0 if s.triangles[t, 0] == v else 1 if s.triangles[t, 1] == v else 2
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _touch(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
     if not s.marked[t]:
         s.marked[t], s.touched[s.n[4]] = 1, t
         s.n[4] += 1
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _set(s, t, vertices, neighbours, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
     for i in range(3):
         s.triangles[t, i], s.neighbours[t, i], s.sides[t, i] = vertices[i], neighbours[i], sides[i]
     _touch(s, t)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def divide(s, t, i, share):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Divide the edge opposite to corner i, at a share of it from corner i + 1, and the triangles on both of its sides."""
     a, b, c = s.triangles[t, i], s.triangles[t, (i + 1) % 3], s.triangles[t, (i + 2) % 3]
@@ -117,13 +130,13 @@ def divide(s, t, i, share):  # type: ignore[no-untyped-def]  # pragma: no cover
     s.at[m], s.at[c] = t, t2
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def has_room(s):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether one more edge can be divided."""
     return s.n[0] + 1 < len(s.at) and s.n[1] + 2 < len(s.triangles)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def bisect(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Bisect a triangle and what its longest-edge propagation path makes necessary; False where there is no room."""
     while True:
@@ -141,14 +154,14 @@ def bisect(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
             return True
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def size2(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Square of the longest edge where the triangle is now."""
     a, b, c = s.triangles[t]
     return max(_length2(s.position, a, b), max(_length2(s.position, b, c), _length2(s.position, c, a)))
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def fan(s, v, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Triangles around a vertex in counterclockwise order, and whether they close; their number is negative if there are too many."""
     first = s.at[v]
@@ -172,13 +185,13 @@ def fan(s, v, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     return -1, closed
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def on_boundary(s, v, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether a vertex lies on the boundary or on a lip of a cut."""
     return not fan(s, v, out)[1]
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def on_edge_of(s, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether a vertex lies INSIDE the surface, on its RIM as it was before any cut, or only on a LIP of a cut."""
     t = s.at[v]
@@ -197,7 +210,7 @@ def on_edge_of(s, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     return RIM if back == -1 else LIP
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def swap(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Swap the edge opposite to corner i if it is the longest of both triangles and they are one plane convex quadrilateral."""
     u = s.neighbours[t, i]
@@ -209,14 +222,14 @@ def swap(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
         j += 1
     e = s.triangles[u, j]
     p = s.rest
-    normal = np.cross(p[b] - p[r], p[c] - p[r])
-    area2 = (normal * normal).sum()
-    new, other = np.cross(p[b] - p[r], p[e] - p[r]), np.cross(p[e] - p[r], p[c] - p[r])
-    whole = np.sqrt(area2) + np.sqrt((np.cross(p[c] - p[e], p[b] - p[e]) ** 2).sum())
-    changed = abs(np.sqrt((new**2).sum()) + np.sqrt((other**2).sum()) - whole)
-    height = abs((normal * (p[e] - p[r])).sum())
+    normal, new, other, behind = _cross(p, r, b, c), _cross(p, r, b, e), _cross(p, r, e, c), _cross(p, e, c, b)
+    area2 = _product(normal, normal)
+    whole = np.sqrt(area2) + np.sqrt(_product(behind, behind))
+    changed = abs(np.sqrt(_product(new, new)) + np.sqrt(_product(other, other)) - whole)
+    height = abs(_product(normal, (p[e, 0] - p[r, 0], p[e, 1] - p[r, 1], p[e, 2] - p[r, 2])))
     least = 0.05 * area2
-    if (new * normal).sum() < least or (other * normal).sum() < least or changed > 1e-12 * whole or height > 1e-9 * area2**0.75:
+    turned = _product(new, normal) < least or _product(other, normal) < least
+    if turned or changed > 1e-12 * whole or height > 1e-9 * area2**0.75:
         return False
     beside_b, beside_c = s.neighbours[t, (i + 1) % 3], s.neighbours[t, (i + 2) % 3]
     near_c, near_b = s.neighbours[u, (j + 1) % 3], s.neighbours[u, (j + 2) % 3]
@@ -230,7 +243,7 @@ def swap(s, t, i):  # type: ignore[no-untyped-def]  # pragma: no cover
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _resolve(s, v, around, count):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Give each group of triangles that still hold together around a vertex a vertex of its own."""
     groups = 0
@@ -249,13 +262,15 @@ def _resolve(s, v, around, count):  # type: ignore[no-untyped-def]  # pragma: no
         if k > 0 and s.neighbours[t, (i + 2) % 3] < 0:
             now = s.n[0]
             s.n[0] += 1
-            s.rest[now], s.position[now], s.ends[now], s.share[now] = s.rest[v], s.position[v], -1, 0.0
+            for j in range(3):
+                s.rest[now, j], s.position[now, j] = s.rest[v, j], s.position[v, j]
+            s.ends[now, 0], s.ends[now, 1], s.share[now] = -1, -1, 0.0
             s.source[now], s.twin[now], s.twin[v] = v, s.twin[v], now
         s.triangles[t, i] = now
         s.at[now] = t
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def separate(s, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Part the triangles on the two sides of an edge, and duplicate its ends where that divides the triangles around them."""
     first, second = np.empty(MOST_AROUND, dtype=np.int64), np.empty(MOST_AROUND, dtype=np.int64)
@@ -277,7 +292,7 @@ def separate(s, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def number_edges(neighbours, sides):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill the numbers of the edges; returns how many there are."""
     count = 0
@@ -295,7 +310,7 @@ def number_edges(neighbours, sides):  # type: ignore[no-untyped-def]  # pragma: 
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def link(triangles, order, keys, neighbours):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill the neighbours from sorted keys of half edges; an edge of three triangles or more, or of equal direction, stays open."""
     seams, n, k = 0, len(order), 0

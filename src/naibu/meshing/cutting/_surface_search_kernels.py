@@ -4,25 +4,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 
 FOLD = 0.7  # cosine of the angle between two triangles, below which the path gets a point on their edge
 _NO_FOLDS = np.zeros(0, dtype=np.int64)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def dot(ax, ay, az, bx, by, bz):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Scalar product of two vectors."""
     return ax * bx + ay * by + az * bz
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def from_to(p, a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vector from row a to row b."""
     return p[b, 0] - p[a, 0], p[b, 1] - p[a, 1], p[b, 2] - p[a, 2]
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _along_edge(p, a, b, qx, qy, qz):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Square of the distance of q from an edge, and the share of its length at which the nearest point lies."""
     ex, ey, ez = from_to(p, a, b)
@@ -32,7 +32,7 @@ def _along_edge(p, a, b, qx, qy, qz):  # type: ignore[no-untyped-def]  # pragma:
     return dot(dx, dy, dz, dx, dy, dz), f
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def nearest_on_triangle(p, a, b, c, qx, qy, qz):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Square of the distance of q from a triangle, and the barycentric coordinates of the nearest point."""
     ux, uy, uz = from_to(p, a, b)
@@ -57,7 +57,7 @@ def nearest_on_triangle(p, a, b, c, qx, qy, qz):  # type: ignore[no-untyped-def]
     return best, first, second, third
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _queue_beside(s, t, mark, jump, queue, tail):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Append what hangs together with a triangle and has not been met, also across cuts where `jump`; returns the number in the queue."""
     for i in range(3):
@@ -77,7 +77,7 @@ def _queue_beside(s, t, mark, jump, queue, tail):  # type: ignore[no-untyped-def
     return tail
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def nearest(s, start, q, radius, jump, queue, point):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Triangle nearest to q within a radius of it, among those that hang together with one, also across cuts where `jump`.
 
@@ -105,7 +105,7 @@ def nearest(s, start, q, radius, jump, queue, point):  # type: ignore[no-untyped
     return where, _beside(p, a, b, c, q, point) if edge else -1.0, best, tail
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def normal_of(p, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vector normal to a triangle, whose length is twice its area."""
     ux, uy, uz = from_to(p, a, b)
@@ -113,13 +113,13 @@ def normal_of(p, a, b, c):  # type: ignore[no-untyped-def]  # pragma: no cover
     return uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def folded(one, two):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether two normals differ by so much that the path has a point where the surface turns from one to the other."""
     return dot(*one, *two) < FOLD * np.sqrt(dot(*one, *one) * dot(*two, *two))
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _beside(p, a, b, c, q, point):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Distance of q from a point of a triangle, within the triangle's plane."""
     nx, ny, nz = normal_of(p, a, b, c)
@@ -129,7 +129,7 @@ def _beside(p, a, b, c, q, point):  # type: ignore[no-untyped-def]  # pragma: no
     return np.sqrt(dot(gx, gy, gz, gx, gy, gz))
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def first_at(length, m, at):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Number of the first of m increasing lengths that is not below `at`."""
     low, high = 0, m
@@ -142,13 +142,13 @@ def first_at(length, m, at):  # type: ignore[no-untyped-def]  # pragma: no cover
     return low
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def on_path(path, length, m, qx, qy, qz, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return distance of q from the part of the path between two lengths, and the length of the nearest point."""
     return on_side_of_path(path, length, path[:0], _NO_FOLDS, m, qx, qy, qz, low, high, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def on_side_of_path(path, length, normals, folds, m, qx, qy, qz, low, high, one, two):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return what `on_path` does, of those pieces of the path only that face as one of two normals does, where unit normals are given.
 
@@ -180,7 +180,7 @@ def on_side_of_path(path, length, normals, folds, m, qx, qy, qz, low, high, one,
     return np.sqrt(best), where
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def along(path, length, m, at):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Point of the path at a length, held at its ends."""
     j = min(max(first_at(length, m, at) - 1, 0), m - 2)
@@ -189,7 +189,7 @@ def along(path, length, m, at):  # type: ignore[no-untyped-def]  # pragma: no co
     return g * path[j, 0] + f * path[j + 1, 0], g * path[j, 1] + f * path[j + 1, 1], g * path[j, 2] + f * path[j + 1, 2]
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def distances_from_path(path, length, places):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Distances of places (k, 3) from the whole path."""
     out = np.empty(len(places))
@@ -198,7 +198,7 @@ def distances_from_path(path, length, places):  # type: ignore[no-untyped-def]  
     return out
 
 
-@njit(cache=True)
+@njit(cache=True, **COUNTED)
 def distances_from_edges(p, edges, places):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Distances of places (k, 3) from the nearest of edges (c, 2), infinite where there is none."""
     out = np.empty(len(places))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.meshing.cutting._surface_grid_kernels import nearest_listed
 from naibu.meshing.cutting._surface_kernels import INSIDE, RIM
 from naibu.meshing.cutting._surface_search_kernels import dot, first_at, folded, nearest, normal_of, on_path, on_side_of_path
@@ -14,16 +14,21 @@ from naibu.meshing.cutting._surface_walk_kernels import (
     AT_BOUNDARY,
     BEGAN,
     BEGIN,
+    BENEATH,
     CLOSING,
     COUNT,
+    CROSSED,
     DISTANCE,
     ENDED,
     ENTERED,
+    FOLDS,
     FULL,
     HEIGHT,
     LAST,
     LEFT,
     LEFT_BEFORE,
+    MIDDLE,
+    NEAREST,
     NO_ROOM,
     NOW,
     PIECE,
@@ -32,6 +37,8 @@ from naibu.meshing.cutting._surface_walk_kernels import (
     SAMPLED,
     STEPPED,
     STUCK,
+    TARGET,
+    TIP,
     WAITING,
     advance,
     begin,
@@ -43,13 +50,13 @@ CROSSING_STEPS = 20
 MOST_OF_SAMPLE = 2 * MOST_CREASES + 2  # points of the path that one position of the tip may add
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _apart(a, b):  # type: ignore[no-untyped-def]  # pragma: no cover
     x, y, z = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     return np.sqrt(dot(x, y, z, x, y, z))
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def append(k, point, tip, triangle, over, normal):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Append a position of the tip and the point beneath it to the path, unless the point is the last one."""
     m = k.whole[COUNT]
@@ -68,7 +75,7 @@ def append(k, point, tip, triangle, over, normal):  # type: ignore[no-untyped-de
     k.whole[COUNT] = m + 1
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _beneath(s, k, grid, tip, near, point):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Triangle beneath a position of the tip, searched from one nearby (-1: everywhere), and where the tip is, as in `ToolArrays.over`.
 
@@ -86,13 +93,13 @@ def _beneath(s, k, grid, tip, near, point):  # type: ignore[no-untyped-def]  # p
     return t, 0 if beside > BESIDE * distance or d2 > reach * reach else RIM if beside >= 0.0 else INSIDE, d2
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def sample(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Append a position of the tip and the point of the surface beneath it, searched from a triangle (-1: everywhere).
 
     Before it, the point of the boundary over which the tip comes or goes, and those of folds of the surface.
     """
-    point = np.empty(3)
+    point = k.work[BENEATH]
     t, over, d2 = _beneath(s, k, grid, tip, near, point)
     k.real[HEIGHT] = np.sqrt(d2) if over else 0.0
     last = k.whole[COUNT] - 1
@@ -104,20 +111,20 @@ def sample(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no
         append(k, tip, tip, t, 0, normal_of(s.position, s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2]))
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _append_over(s, k, point, tip, t, over):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Append a position over the surface, and before it the folds between it and the last one."""
     last = k.whole[COUNT] - 1
     facing = normal_of(s.position, s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2])
     if last >= 0 and k.over[last] and k.triangle[last] != t:
-        points, normals = np.empty((MOST_CREASES, 3)), np.empty((MOST_CREASES, 3))
+        points, normals = k.work[FOLDS : FOLDS + MOST_CREASES], k.work[FOLDS + MOST_CREASES :]
         count = creases(s, t, point, k.points[last], k.normals[last], k.real[DISTANCE], points, normals)
         for c in range(count - 1, -1, -1):  # they come from the end; the normals are those of the pieces before
             append(k, points[c], tip, t, INSIDE, (normals[c, 0], normals[c, 1], normals[c, 2]))
     append(k, point, tip, t, over, facing)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _append_crossing(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Append where the way of the tip from its last position crosses the boundary, by bisection: the point nearest to it just outside.
 
@@ -125,7 +132,7 @@ def _append_crossing(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # 
     """
     last = k.whole[COUNT] - 1
     inward = k.over[last] == 0
-    low, high, middle, point = 0.0, 1.0, np.empty(3), np.empty(3)
+    low, high, middle, point = 0.0, 1.0, k.work[MIDDLE], k.work[CROSSED]
     for step in range(CROSSING_STEPS + 1):
         f = 0.5 * (low + high) if step < CROSSING_STEPS else (low if inward else high)
         for j in range(3):
@@ -139,7 +146,7 @@ def _append_crossing(s, k, grid, tip, near):  # type: ignore[no-untyped-def]  # 
         _append_over(s, k, point, middle, t, RIM)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _ahead(k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Point of the path at which the cut begins or goes on; -1 where there is none yet."""
     m, distance = k.whole[COUNT], k.real[DISTANCE]
@@ -149,7 +156,7 @@ def _ahead(k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     return -1 if i == m or (not final and k.length[m - 1] - k.length[i] < 2.0 * distance) else i
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _length_beside(s, k, v, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Length of the path beside a vertex, of the pieces that face as a triangle there does if any is near."""
     p, m, t = s.position, k.whole[COUNT], s.at[v]
@@ -160,18 +167,19 @@ def _length_beside(s, k, v, low, high):  # type: ignore[no-untyped-def]  # pragm
     return on_path(k.points, k.length, m, p[v, 0], p[v, 1], p[v, 2], low, high)[1]
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _enter(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Find the vertex at which the cut begins, or goes on behind an edge or an earlier cut; returns STEPPED, WAITING or FULL."""
     whole, real, distance = k.whole, k.real, k.real[DISTANCE]
-    target, point = np.empty(3), np.empty(3)
+    target, point = k.work[TARGET], k.work[NEAREST]
     while True:
         i = _ahead(k, final)
         if i < 0:
             return WAITING
         k.triangle[i] = nearest(s, k.triangle[i], k.points[i], 2.0 * distance, True, k.queue, point)[0]  # it may have been cut since
         edge = whole[LEFT_BEFORE] != 0 or k.over[i] == RIM
-        target[:] = real[LAST : LAST + 3] if whole[LEFT_BEFORE] else k.points[i]
+        for a in range(3):
+            target[a] = real[LAST + a] if whole[LEFT_BEFORE] else k.points[i, a]
         j = i - 1
         while j >= 0 and k.over[j] != 0 and k.length[j] >= real[AT] - distance:
             j -= 1
@@ -179,7 +187,8 @@ def _enter(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
         if comes:
             i, edge = j + 1, True
             k.triangle[i] = nearest(s, k.triangle[i], k.points[i], 2.0 * distance, True, k.queue, point)[0]
-            target[:] = k.points[i]
+            for a in range(3):
+                target[a] = k.points[i, a]
         low, high = max(real[AT], k.length[i] - 2.0 * distance), k.length[i] + distance
         found = begin(s, k, k.triangle[i], target, low, high, edge, point)
         if found == NO_ROOM:
@@ -194,7 +203,7 @@ def _enter(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
         whole[LEFT_BEFORE] = 0  # the next try begins inside
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def walk(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Let the cut follow the tool as far as it may; FULL where there is no room."""
     whole, real = k.whole, k.real
@@ -220,7 +229,7 @@ def walk(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
                 return WAITING  # the loop is closed
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def follow(s, k, grid, goal, again):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move the tip along a straight line; FULL where there is no room, after which it is called `again` with more."""
     whole, real = k.whole, k.real
@@ -229,10 +238,11 @@ def follow(s, k, grid, goal, again):  # type: ignore[no-untyped-def]  # pragma: 
         return WAITING
     if not again:
         last = k.tips[whole[COUNT] - 1]
-        real[BEGIN : BEGIN + 3] = last
+        for i in range(3):
+            real[BEGIN + i] = last[i]
         whole[PIECES] = max(1, int(np.ceil(SAMPLES * _apart(last, goal) / real[DISTANCE])))
         whole[PIECE], whole[SAMPLED] = 1, 0
-    tip = np.empty(3)
+    tip = k.work[TIP]
     while whole[PIECE] <= whole[PIECES]:
         if not whole[SAMPLED]:
             if whole[COUNT] + MOST_OF_SAMPLE > len(k.length):
@@ -248,7 +258,7 @@ def follow(s, k, grid, goal, again):  # type: ignore[no-untyped-def]  # pragma: 
     return WAITING
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def close(k):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Where the path ends at its beginning, follow it a little further, so that the cut meets its own beginning."""
     distance, last = k.real[DISTANCE], k.whole[COUNT] - 1

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.meshing.cutting._surface_kernels import (
     INSIDE,
@@ -35,6 +35,7 @@ from naibu.meshing.cutting._surface_search_kernels import (
     on_path,
     on_side_of_path,
 )
+from naibu.meshing.cutting._surface_trace_kernels import MOST_CREASES
 
 WAITING, STEPPED, LEFT, ENDED, STUCK, FULL = 0, 1, 2, 3, 4, 5
 NO_ROOM = -2
@@ -50,6 +51,9 @@ COUNT, EDGES, NOW, AT_BOUNDARY, BEGAN, LEFT_BEFORE, FREE, PIECE, PIECES, SAMPLED
 # entries of `ToolArrays.real`: distance, reach, length of the path beside the cut, height of the tip, length at which a loop is closed,
 # where the cut left the surface, where a movement began, length at which the path of the cut came over the boundary
 DISTANCE, REACH, AT, HEIGHT, CLOSING, LAST, BEGIN, ENTERED = 0, 1, 2, 3, 4, 5, 8, 11
+# rows of `ToolArrays.work`: the tip and the point beneath it, those where it crosses a boundary, where a cut begins, and folds on the way
+TIP, BENEATH, MIDDLE, CROSSED, TARGET, NEAREST, FOLDS = 0, 1, 2, 3, 4, 5, 6
+ROWS = FOLDS + 2 * MOST_CREASES
 
 
 class ToolArrays(NamedTuple):
@@ -67,9 +71,10 @@ class ToolArrays(NamedTuple):
     around: IntArray
     whole: IntArray
     real: FloatArray
+    work: FloatArray  # (ROWS, 3) places that kernels pass on, each to others than its own rows
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def refine_around(s, v, bound, around):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Bisect until no triangle around a vertex has an edge of `bound` or more; False where there is no room."""
     while True:
@@ -84,14 +89,14 @@ def refine_around(s, v, bound, around):  # type: ignore[no-untyped-def]  # pragm
             return False
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _facing(s, t):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vector normal to a triangle; zero, so that all pieces of the path face as it does, where the triangle is too flat to tell."""
     x, y, z = normal_of(s.position, s.triangles[t, 0], s.triangles[t, 1], s.triangles[t, 2])
     return (x, y, z) if np.sqrt(dot(x, y, z, x, y, z)) > TOO_FLAT * size2(s, t) else (0.0, 0.0, 0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _fits(s, k, r, c, t, u, size, least, back):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Return the length of the path beside vertex c if the way from r leads on and stays near the path, and -1 otherwise.
 
@@ -131,7 +136,7 @@ def _fits(s, k, r, c, t, u, size, least, back):  # type: ignore[no-untyped-def] 
     return at if back else reached
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _folds_near(k, low, high):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether the path crosses a fold between two lengths."""
     m = k.whole[COUNT]
@@ -139,7 +144,7 @@ def _folds_near(k, low, high):  # type: ignore[no-untyped-def]  # pragma: no cov
     return k.folds[min(max(i, 1), m - 1)] != k.folds[min(j + 1, m - 1)]
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _nearer(s, k, r, c, least):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether vertex c is nearer than r to the point of the path beside the cut."""
     x, y, z = along(k.points, k.length, k.whole[COUNT], k.real[AT])
@@ -148,7 +153,7 @@ def _nearer(s, k, r, c, least):  # type: ignore[no-untyped-def]  # pragma: no co
     return np.sqrt(dot(cx, cy, cz, cx, cy, cz)) < np.sqrt(dot(rx, ry, rz, rx, ry, rz)) - least
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _leaves(s, k, r):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether the path leaves the surface within two distances ahead of the cut, as far as it is known."""
     m, at = k.whole[COUNT], k.real[AT]
@@ -162,7 +167,7 @@ def _leaves(s, k, r):  # type: ignore[no-untyped-def]  # pragma: no cover
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _turns_back(s, k, c):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether a vertex lies on the latest edges of the cut."""
     p, e, gone, distance = s.position, k.whole[EDGES] - 1, 0.0, k.real[DISTANCE]
@@ -176,21 +181,21 @@ def _turns_back(s, k, c):  # type: ignore[no-untyped-def]  # pragma: no cover
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _may_end_at(s, k, r, c):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether the cut may go to a vertex: not to the boundary unless the path leaves the surface, nor back to where it comes from."""
     where = on_edge_of(s, c)
     return where == INSIDE or (where == RIM and _leaves(s, k, r)) or (where == LIP and not _turns_back(s, k, c))
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _from_end2(s, k, v):  # type: ignore[no-untyped-def]  # pragma: no cover
     last = k.whole[COUNT] - 1
     x, y, z = s.position[v, 0] - k.points[last, 0], s.position[v, 1] - k.points[last, 1], s.position[v, 2] - k.points[last, 2]
     return dot(x, y, z, x, y, z)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _best(s, k, r, across, anywhere, back):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vertex whose edge lies closest to the direction of the path, -1 if none, its triangle, corner and kind, and the length beside it.
 
@@ -228,7 +233,7 @@ def _best(s, k, r, across, anywhere, back):  # type: ignore[no-untyped-def]  # p
     return found, beside, which, how, reached
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _next(s, k, r, anywhere, back):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Neighbour of a vertex, or the one across the longest edge of a triangle around it, closest to the path's direction; -1 if none."""
     found, t, i, kind, reached = _best(s, k, r, True, anywhere, back)
@@ -237,7 +242,7 @@ def _next(s, k, r, anywhere, back):  # type: ignore[no-untyped-def]  # pragma: n
     return found, reached
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _next_fold(k):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Length of the path at the next fold ahead of the cut, or at its end."""
     m = k.whole[COUNT]
@@ -247,7 +252,7 @@ def _next_fold(k):  # type: ignore[no-untyped-def]  # pragma: no cover
     return k.length[min(j, m - 1)]
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _ahead_of(s, k, r, back):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Triangle around a vertex through which the straight way back to the path leads, the vertex's corner, and the share of its edge.
 
@@ -273,7 +278,7 @@ def _ahead_of(s, k, r, back):  # type: ignore[no-untyped-def]  # pragma: no cove
     return -1, 0, 0.5
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _through(s, r, u, qx, qy, qz):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Corner of a triangle that a vertex is, the share of the edge opposite where the way to q leads over it, and its square within."""
     p, j = s.position, corner(s, u, r)
@@ -295,7 +300,7 @@ def _through(s, r, u, qx, qy, qz):  # type: ignore[no-untyped-def]  # pragma: no
     return j, f / (g + f), g * ab + f * ac
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _divided(s, k, r, anywhere, back):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vertex that divides an edge where the straight way back to the path crosses it, and the length beside it; -1 if none."""
     t, i, exact = _ahead_of(s, k, r, back)
@@ -313,7 +318,7 @@ def _divided(s, k, r, anywhere, back):  # type: ignore[no-untyped-def]  # pragma
     return -1, -1.0
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take one step of the cut; returns what came of it."""
     whole, distance, free = k.whole, k.real[DISTANCE], k.whole[FREE]
@@ -356,7 +361,7 @@ def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     return ENDED if left < distance or free else STUCK
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _leads_into(p, o, a, b, ahead):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether a direction leads over edge a-b towards the side on which corner o lies."""
     ex, ey, ez = from_to(p, a, b)
@@ -365,7 +370,7 @@ def _leads_into(p, o, a, b, ahead):  # type: ignore[no-untyped-def]  # pragma: n
     return dot(ox - f * ex, oy - f * ey, oz - f * ez, ahead[0], ahead[1], ahead[2]) > 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _end_near(s, t, q, ahead, same2, edge, count, queue):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Triangle and vertex whose edge, of a triangle or among those of the boundary nearby if `edge`, is nearest to q; -1 if none.
 
@@ -390,12 +395,12 @@ def _end_near(s, t, q, ahead, same2, edge, count, queue):  # type: ignore[no-unt
     return where, found
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def begin(s, k, t, q, low, high, edge, point):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Vertex near q within half the distance of the path, on the boundary if `edge`; -1 if there is none, -2 where there is no room."""
-    distance, free, found, ahead = k.real[DISTANCE], k.whole[FREE], -1, np.empty(3)
-    ahead[:] = along(k.points, k.length, k.whole[COUNT], high)
-    ahead -= q
+    distance, free, found = k.real[DISTANCE], k.whole[FREE], -1
+    x, y, z = along(k.points, k.length, k.whole[COUNT], high)
+    ahead = x - q[0], y - q[1], z - q[2]
     for h in range(FINEST + 1):
         bound = distance * 0.5**h
         while True:

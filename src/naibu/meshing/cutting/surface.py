@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from naibu._numba.intrinsics.packed_tuples import packed_items
 from naibu.core.arrays import FloatArray, IntArray, as_points, as_vector, require_positive
 from naibu.core.errors import InputError
 from naibu.meshing.cutting import _surface_tool_kernels as tool_kernels
@@ -67,6 +68,7 @@ class SurfaceCutter:
         size = float(np.linalg.norm(np.diff(start.points[start.triangles], axis=1), axis=2).mean())
         self._grid = grid_of(start.points, start.triangles, max(size, self.reach_mm))
         self._tool = _tool(self.distance_mm, self.reach_mm, refined)
+        self._pack()
         self._paths: list[ToolPath] = []
         self._closed: list[bool] = []
 
@@ -84,16 +86,16 @@ class SurfaceCutter:
             NaN, or a surface that has grown beyond 5 million triangles.
         """
         goal = as_vector("tip", tip)
-        if tool_kernels.follow(self.arrays, self._tool, self._grid, goal, False) == walk.FULL:
-            self._with_room(lambda: int(tool_kernels.follow(self.arrays, self._tool, self._grid, goal, True)))
+        if tool_kernels.follow(*self._packed, goal, False) == walk.FULL:
+            self._with_room(lambda: int(tool_kernels.follow(*self._packed, goal, True)))
 
     def lift(self) -> None:
         """Take the tool off: the cut is finished up to where it was."""
         whole, count = self._tool.whole, int(self._tool.whole[walk.COUNT])
         if count > 1:
             self._grow_tool(2 * count)
-            tool_kernels.close(self._tool)
-            self._with_room(lambda: int(tool_kernels.walk(self.arrays, self._tool, True)))
+            tool_kernels.close(self._packed[1])
+            self._with_room(lambda: int(tool_kernels.walk(*self._packed[:2], True)))
             k, count = self._tool, int(whole[walk.COUNT])
             self._closed.append(bool(np.isfinite(k.real[walk.CLOSING])))
             self._paths.append((k.points[:count].copy(), k.tips[:count].copy(), k.over[:count] > 0))
@@ -128,6 +130,11 @@ class SurfaceCutter:
         path: list[Any] = [_grown(a, more) if more else a for a in k[:7]]
         edges = _grown(k.edges, len(k.edges)) if 2 * self.n_steps > len(k.edges) else k.edges
         self._tool = ToolArrays(*[*path, edges, *k[8:]])
+        self._pack()
+
+    def _pack(self) -> None:
+        """Hand over other arrays to the kernels from now on."""
+        self._packed = packed_items(self.arrays), packed_items(self._tool), packed_items(self._grid)
 
 
 def cut_surface(
@@ -184,7 +191,7 @@ def _tool(distance_mm: float, reach_mm: float, refined: bool) -> ToolArrays:
     tool = ToolArrays(
         np.zeros((ROOM, 3)), np.zeros(ROOM), np.zeros((ROOM, 3)), whole(ROOM), whole(ROOM), np.zeros((ROOM, 3)), whole(ROOM),
         whole(ROOM, 2),
-        whole(QUEUE), whole(MOST_AROUND), numbers, real,
+        whole(QUEUE), whole(MOST_AROUND), numbers, real, np.zeros((walk.ROWS, 3)),
     )  # fmt: skip
     _put_down(tool)
     return tool
