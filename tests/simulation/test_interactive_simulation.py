@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections.abc import Generator
 from dataclasses import replace
 
 import numpy as np
@@ -222,10 +223,17 @@ def test_a_body_of_which_two_steps_fail_one_after_the_other_is_stopped_and_that_
     touched.close()
 
 
+def without_quasi_newton(monkeypatch: pytest.MonkeyPatch) -> None:
+    def finds_nothing(*_: object) -> Generator[None, None, None]:
+        yield from ()
+
+    monkeypatch.setattr(RealTimeSession, "_quasi_newton", finds_nothing)
+
+
 def test_newtons_method_gives_up_a_step_that_a_loop_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without quasi-Newton iterations and with no time for Newton's method; a step that nobody waits for is taken to its end."""
-    monkeypatch.setattr("naibu.mechanics.finite_strain.sessions.real_time_session.NEWTON_S", 0.0)
-    monkeypatch.setattr(RealTimeSession, "_gone_on", lambda *_: None)
+    monkeypatch.setattr("naibu.mechanics.finite_strain.sessions.newton_session.NEWTON_S", 0.0)
+    without_quasi_newton(monkeypatch)
     ends = []
     for budget in (np.inf, 0.01):
         touched = InteractiveSimulation(lattice_or_gel("gel"), {"sphere": spherical_indenter((20.0, 20.0, 60.0), 8.0)}, budget_s=budget)
@@ -233,10 +241,37 @@ def test_newtons_method_gives_up_a_step_that_a_loop_waits_for(monkeypatch: pytes
         touched.move((20.0, 20.0, TOP + 5.0))
         for _ in range(4):
             frame = touched.advance()
+            while frame.under_way:
+                frame = touched.advance()
         ends.append(frame)
         touched.close()
     assert not ends[0].failed and ends[0].time_s == pytest.approx(4 / 60)
     assert "finds no balance" in ends[1].failed and ends[1].time_s == 0.0
+
+
+def test_frames_go_on_while_newtons_method_finds_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread finds what it finds where nobody waits; a step that is given up, as by Reset, leaves nothing behind."""
+    without_quasi_newton(monkeypatch)
+    ends, most = [], 0
+    for budget in (np.inf, 0.0, 0.0):
+        touched = InteractiveSimulation(lattice_or_gel("gel"), {"sphere": spherical_indenter((20.0, 20.0, 60.0), 8.0)}, budget_s=budget)
+        touched.take("sphere")
+        for height in np.linspace(52.0, TOP + 5.0, 8):
+            touched.move((20.0, 20.0, height))
+            frame, frames = touched.advance(), 0
+            if len(ends) == 2 and height < 50.0 and frame.under_way:
+                touched.reset()
+                assert touched.advance().failed == ""
+                break
+            while frame.under_way:
+                frame, frames = touched.advance(), frames + 1
+            most = max(most, frames)
+        ends.append(frame)
+        touched.close()
+    assert most > 1
+    np.testing.assert_allclose(ends[1].positions, ends[0].positions, atol=1e-3 * TOP)  # with other factors, to the same tolerance
+    np.testing.assert_allclose(ends[1].force, ends[0].force, atol=0.01 * abs(ends[0].force[2]))
+    np.testing.assert_allclose(touched.last.positions, touched.body.points, atol=1e-9)
 
 
 def test_frames_that_leave_their_step_to_the_next_come_to_the_same_states() -> None:

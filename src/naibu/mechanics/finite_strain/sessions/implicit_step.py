@@ -20,6 +20,9 @@ from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 
 HALVINGS = 6  # of a Newton step that inverts an element or goes too far
 ACCEPTED = 5.0  # tolerances: residual of a step that has used up its iterations
+DAMPED_ITERATIONS = 40
+LEAST_LESS = 0.1  # of the decrease of the work on a step that the tangent promises, which must come
+SHIFT, GROWTH, LARGEST_SHIFT = 1e-3, 4.0, 10.0  # of the mean diagonal of the tangent: first, from one to the next, and at most
 
 LinearSolve = Callable[[sp.bsr_matrix, FloatArray], FloatArray]  # a matrix and a right side (n, 3) to the solution (n, 3)
 
@@ -94,6 +97,66 @@ class ImplicitStep:
         if float(np.abs(residual).sum()) > ACCEPTED * allowed:
             raise ConvergenceError(f"no balance within {self.iterations} iterations")
         return u
+
+    def damped(self, u: FloatArray, linear: LinearSolve) -> FloatArray:
+        """Return a balance as `solved` does, also where a tangent is indefinite: by the method of Levenberg and Marquardt.
+
+        Where a step does not let the residual do less work, as the tangent promises, inertia is added to the tangent, as that of a shorter
+        time: the iterations follow the force downhill until the tangent can be trusted again :cite:p:`nocedal2006`.
+
+        Raises
+        ------
+        ConvergenceError
+            An inverted element at `u`, or too many iterations.
+        """
+        residual, allowed = self.residual(u)
+        shift = 0.0
+        for _ in range(DAMPED_ITERATIONS):
+            if float(np.abs(residual).sum()) <= allowed:
+                return u
+            tangent, after = self.tangent(u), None
+            inertia = self._inertia_like(tangent)
+            while after is None:
+                step = -linear(self._with_inertia(tangent, shift * inertia), residual)
+                after = self._downhill(u, step, residual, shift * float((inertia[:, None] * step**2).sum()))
+                if after is None:
+                    shift = max(GROWTH * shift, SHIFT)
+                    if shift > LARGEST_SHIFT:
+                        raise ConvergenceError("no direction reduces the residual")
+            u, residual, allowed = after
+            shift = shift / GROWTH if shift > SHIFT else 0.0
+        raise ConvergenceError(f"no balance within {DAMPED_ITERATIONS} damped iterations")
+
+    def _inertia_like(self, tangent: sp.bsr_matrix) -> FloatArray:
+        """Return stiffnesses (n,), mN/mm, in proportion to the masses, in the mean those of the diagonal of a tangent."""
+        diagonal = tangent.diagonal().reshape(-1, 3)[~self.constrained.any(axis=1)]
+        return self.mass * (float(diagonal.mean()) / float(self.mass.mean())) if len(diagonal) else np.zeros_like(self.mass)
+
+    def _with_inertia(self, tangent: sp.bsr_matrix, inertia: FloatArray) -> sp.bsr_matrix:
+        """Return a tangent with stiffnesses (n,), mN/mm, on its diagonal."""
+        if not inertia.any():
+            return tangent
+        out = tangent.copy()
+        out.data[self.assembler.pattern.diagonal()] += inertia[:, None, None] * np.eye(3)
+        return with_dirichlet_rows(out, self.constrained)
+
+    def _downhill(
+        self, u: FloatArray, step: FloatArray, residual: FloatArray, of_inertia: float
+    ) -> tuple[FloatArray, FloatArray, float] | None:
+        """Return the end of the largest part of a step on which the residual does less work, and the residual there; None without one.
+
+        The inertia in the tangent lets a work `of_inertia` be left, mN mm.
+        """
+        before = abs(float((residual * step).sum()))
+        for part in (1.0, 0.5, 0.25):
+            trial = u + part * step
+            try:
+                after, allowed = self.residual(trial)
+            except ConvergenceError:
+                continue
+            if abs(float((after * step).sum())) < before - LEAST_LESS * part * max(before - of_inertia, 0.0):
+                return trial, after, allowed
+        return None
 
     def residual(self, u: FloatArray) -> tuple[FloatArray, float]:
         """Return the out-of-balance force (n, 3) and how much of it is allowed, mN.

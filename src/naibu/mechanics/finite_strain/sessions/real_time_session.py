@@ -14,7 +14,6 @@ from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray
@@ -29,11 +28,10 @@ from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_po
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, UNAIDED, CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
-from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import changing_lips
+from naibu.mechanics.finite_strain.sessions.newton_session import NewtonSession
 from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel
 from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
-from naibu.mechanics.finite_strain.sessions.tangent_session import TangentSession
 from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, PASSABLE, Trial
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 
@@ -42,7 +40,6 @@ USUAL = 3  # of a step whose balance is then passable
 DEPTH = 4  # earlier iterations that are mixed
 ACCEPTED = 0.06  # of a step that has used up its iterations; where it was 0.2, some later steps found no balance and took seconds
 BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is taken; one that is worse goes on, and real time is lost
-NEWTON_S = 10.0  # of a processor for Newton's method in a step that a loop waits for
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
 FURTHER, NEARER = 5, 0.7  # more of them, where the others reduced the error to so much of what it was before
 STALLED = 0.02  # of the contact forces: what iterations that reduce the error no longer may leave where sides of cuts rub
@@ -82,13 +79,11 @@ class _UnderWay(Exception):
 
 
 @dataclass(slots=True, eq=False)
-class RealTimeSession(TangentSession):
-    """A body in motion that a loop steps in real time; made by `RealTimeEngine.session`. See `DynamicSession` for the other attributes.
+class RealTimeSession(NewtonSession):
+    """A body in motion that a loop steps in real time; made by `RealTimeEngine.session`. See `NewtonSession` for the other attributes.
 
     Attributes
     ----------
-    newton_steps : int
-        Steps so far that Newton's method had to take.
     waits : int
         Steps so far that had to wait for a tangent of their own.
     iterations : int
@@ -100,7 +95,6 @@ class RealTimeSession(TangentSession):
         forces or of those of contact, whichever is more; 0 where Newton's method took it.
     """
 
-    newton_steps: int = field(init=False, default=0)
     waits: int = field(init=False, default=0)
     iterations: int = field(init=False, default=0)
     _gaps: tuple[FloatArray, ...] = field(init=False, default=())
@@ -108,8 +102,7 @@ class RealTimeSession(TangentSession):
     _trial: Trial | None = field(init=False, default=None)
     _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
     _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
-    _search: Generator[None, None, Trial | None] | None = field(init=False, default=None)  # of the step under way
-    _newton_until: float = field(init=False, default=np.inf)  # processor time at which Newton's method gives a step up
+    _search: Generator[None, None, Trial | FloatArray | None] | None = field(init=False, default=None)  # of the step under way
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Bring these indenters, and no others, into play; see `DynamicSession.press`."""
@@ -136,8 +129,8 @@ class RealTimeSession(TangentSession):
     def step_within(self, budget_s: float, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = ()) -> StepForces | None:
         """Take a step, or work on it for about a time of the processor; None: call again, with the same motions, to go on with it.
 
-        The state is that before the step until its balance is found. Newton's method, where it is needed, is not divided; after `NEWTON_S`
-        the step fails as one does that has no balance.
+        The state is that before the step until its balance is found. Newton's method, where it is needed, is left to a thread; after
+        `naibu.mechanics.finite_strain.sessions.newton_session.NEWTON_S` the step fails as one does that has no balance.
         """
         self._until = time.thread_time() + budget_s
         try:
@@ -168,31 +161,34 @@ class RealTimeSession(TangentSession):
 
     def _balanced(self, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> FloatArray | None:
         """Return the displacement that balances momentum after a time `h`; by Newton's method where it is not found in real time."""
-        if h == self.engine.step:
-            self._trial = self._gone_on(self._search or self._quasi_newton(moving, contacts))
-            if self._trial is not None:
-                return self._trial.displacement
-            self.newton_steps += 1
-            self._newton_until = time.thread_time() + NEWTON_S if self._until < np.inf else np.inf
+        whole = h == self.engine.step
+        found = self._gone_on(self._search or self._sought(moving, contacts)) if whole else None
+        if isinstance(found, Trial):
+            self._trial = found
+            return found.displacement
+        self.newton_steps += whole
         self._pressure, self._trial, self._near, self._gaps = None, None, (), ()
+        if whole and self._until < np.inf:  # a thread has tried
+            if found is None:
+                raise ConvergenceError(f"a step of {h:g} s finds no balance of momentum; move the indenter more slowly, or less deep")
+            return found
         return DynamicSession._balanced(self, h, moving, contacts)
 
-    def _found(self, step: ImplicitStep, guess: FloatArray) -> FloatArray | None:
-        return None if time.thread_time() > self._newton_until else DynamicSession._found(self, step, guess)
+    def _sought(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, Trial | FloatArray | None]:
+        """Return the balance of a step; what Newton's method finds where it is needed, if a loop waits: a thread then tries that."""
+        trial = yield from self._quasi_newton(moving, contacts)
+        if trial is not None or self._until == np.inf:
+            return trial
+        return (yield from self._newtons_beside(moving, contacts))
 
-    def _solved(self, matrix: sp.bsr_matrix, residual: FloatArray) -> FloatArray:
-        if time.thread_time() > self._newton_until:
-            raise ConvergenceError("Newton's method takes longer than a step may")
-        return DynamicSession._solved(self, matrix, residual)
-
-    def _gone_on(self, search: Generator[None, None, Trial | None]) -> Trial | None:
+    def _gone_on(self, search: Generator[None, None, Trial | FloatArray | None]) -> Trial | FloatArray | None:
         """Return what a search finds; where it takes longer than it may, it is kept for the next call."""
         self._search = None
         while True:
             try:
                 next(search)
             except StopIteration as end:
-                found: Trial | None = end.value
+                found: Trial | FloatArray | None = end.value
                 return found
             if time.thread_time() > self._until:
                 self._search = search
@@ -355,7 +351,11 @@ class RealTimeSession(TangentSession):
         wrong, touching = float(np.abs(residual).sum()), float(np.abs(contact).sum()) + rubbing
         balance += (engine.mass / engine.step**2)[:, None] * (u - inertial) - self.external_force
         error = wrong / (float(allowed) / engine.tolerance + touching)
-        felt = wrong / (touching + engine.faint_mn) if touching else 0.0
+        exerted = touching
+        if touching and not rubbing:  # a body that is pulled off its table hardly touches it; friction of sides is small beside pulls
+            pulls = [np.abs((balance - contact)[nodes].sum(axis=0)).sum() for nodes in self.bodies[1:]]
+            exerted = max(touching, *map(float, pulls)) if pulls else touching
+        felt = wrong / (exerted + engine.faint_mn) if touching else 0.0
         return Trial(u, pressure, balance, contact, mismatch, error, felt)
 
     def _with_contact(self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool) -> Generator[None, None, FloatArray]:

@@ -34,7 +34,7 @@ class Trial:
     error : float
         Sum of the out-of-balance forces of the nodes, as a fraction of that of all forces.
     felt : float
-        The same, as a fraction of the contact forces; 0 without contact.
+        The same, as a fraction of the forces of contact, or of pulls on gripped nodes where these are more; 0 without contact.
     """
 
     displacement: FloatArray
@@ -47,7 +47,7 @@ class Trial:
 
     @property
     def unbalanced(self) -> float:
-        """What is out of balance, as a fraction of all forces or of the contact forces, whichever is more."""
+        """What is out of balance, as a fraction of all forces, or of those of contact or pulling, whichever is most."""
         return max(self.error, self.felt)
 
     def better(self, other: Trial | None) -> Trial:
