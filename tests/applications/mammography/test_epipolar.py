@@ -7,7 +7,7 @@ import pytest
 
 from naibu.applications.mammography.breast_outline import BreastOutline, breast_outline, inside_polygon
 from naibu.applications.mammography.breast_shape import half_ellipsoid_shape
-from naibu.applications.mammography.epipolar import MammographicPair, ModelUncertainty
+from naibu.applications.mammography.epipolar import EpipolarCurve, MammographicPair, ModelUncertainty
 from naibu.applications.mammography.geometric_model import DEFAULT_PARAMETERS, Compression, CompressionParameters, compressed
 from naibu.applications.mammography.pair_construction import mammographic_pair, pair_of_shape
 from naibu.applications.mammography.two_views import two_views
@@ -153,6 +153,19 @@ def test_the_band_covers_breasts_with_other_parameters() -> None:
 def test_the_same_seed_gives_the_same_band(pair: MammographicPair) -> None:
     again = mammographic_pair(*pair.outlines, PLATES, ANGLE, draws=60, seed=1)
     np.testing.assert_array_equal(again.epipolar_curve([50.0, 10.0]).band, pair.epipolar_curve([50.0, 10.0]).band)
+
+
+def test_where_the_curve_bends_by_more_than_the_band_is_wide_the_band_has_no_hole() -> None:
+    """A quarter of a circle of 5 mm between straight lines, and a band of 20 mm to either side: what lies along a normal is in it."""
+    turn, run = np.linspace(0.0, 0.5 * np.pi, 31)[:, None], np.linspace(0.0, 30.0, 31)[:, None]
+    bend = 5.0 * np.hstack([np.sin(turn), 1.0 - np.cos(turn)])
+    curve = np.vstack([np.hstack([run - 30.0, 0.0 * run]), bend[1:-1], bend[-1] + np.hstack([0.0 * run, run])])
+    normal = np.vstack([np.tile([0.0, 1.0], (31, 1)), np.hstack([-np.sin(turn), np.cos(turn)])[1:-1], np.tile([-1.0, 0.0], (31, 1))])
+    found = EpipolarCurve(curve, np.zeros((len(curve), 3)), np.vstack([curve + 20.0 * normal, (curve - 20.0 * normal)[::-1]]), 0.95)
+    across = np.linspace(-19.0, 19.0, 39)[:, None, None]
+    places = (0.5 * (curve[1:] + curve[:-1]) + across * 0.5 * (normal[1:] + normal[:-1])).reshape(-1, 2)
+    assert found.in_band(places).all() and not found.in_band([[-10.0, -25.0], [40.0, 10.0]]).any()
+    assert not inside_polygon(found.band, places).all()  # the polygon has one
 
 
 def test_points_that_belong_to_no_lesion_are_told(pair: MammographicPair) -> None:

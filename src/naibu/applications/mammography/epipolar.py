@@ -79,9 +79,22 @@ class EpipolarCurve:
     band: FloatArray
     probability: float
 
+    @property
+    def strips(self) -> FloatArray:
+        """Pieces of the band between neighbouring points of the curve, (n - 1, 4, 2), mm, in one sense of rotation.
+
+        Where the curve bends by more than the band is wide, the polygon lies over itself, and is empty there by the even-odd rule.
+        """
+        n = len(self.curve)
+        upper, lower = self.band[:n], self.band[n:][::-1]
+        strips = np.stack([upper[:-1], upper[1:], lower[1:], lower[:-1]], axis=1)
+        x, y = np.moveaxis(strips, 2, 0)
+        area = (x * np.roll(y, -1, axis=1) - np.roll(x, -1, axis=1) * y).sum(axis=1)
+        return np.where((area < 0.0)[:, None, None], strips[:, ::-1], strips)
+
     def in_band(self, places: ArrayLike) -> BoolArray:
         """Return which places (..., 2) lie in the band."""
-        return inside_polygon(self.band, places)
+        return np.any([inside_polygon(strip, places) for strip in self.strips], axis=0)
 
     def distance(self, place: ArrayLike) -> float:
         """Return the distance of a place (2,) from the curve, mm."""

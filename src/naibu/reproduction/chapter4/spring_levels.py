@@ -51,7 +51,7 @@ def levels_section(coarse: Mesh, cubes: int, young_modulus: float) -> Section:
         worst = max(worst, off)
         rows.append((level, length, volume, stiffness, own, volumes[0], volumes[1], springs[0], springs[1]))
     columns = (
-        "level", "L, mm", "V, mm^3", "K, mN/mm", "mesh: L, mm", "V, least", "V, largest", "K, least, mN/mm", "K, largest, mN/mm",
+        "level", "L, mm", "V, mm³", "K, mN/mm", "mesh: L, mm", "V, least", "V, largest", "K, least, mN/mm", "K, largest, mN/mm",
     )  # fmt: skip
     agreement = "agree to rounding" if worst < EXACT else f"differ by up to {worst:.1e}"
     text = (

@@ -24,13 +24,17 @@ def draw_views(
     projection: Projection | None,
 ) -> None:
     """Draw CC and MLO in image coordinates, mm, with the points, the curve and band of the point of the other view, and a scan's point."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
     axis_names = ("along the chest wall, laterally (mm)", "along the chest wall, upwards (mm)")
     for k, (axes, name) in enumerate(zip(canvas.subplots(1, 2), ("CC", "MLO"), strict=True)):
         outline, curve, place = outlines[k], curves[1 - k], places[k]
         axes.plot(*outline.to_image(outline.polygon).T, color="k", linewidth=1.0, label="outline")
         axes.axvline(outline.wall_mm, color="0.6", linewidth=2.0, label="chest wall")
         if curve is not None:
-            axes.fill(*outline.to_image(curve.band).T, color="C0", alpha=0.2, linewidth=0, label="95 % band")
+            band = Path.make_compound_path_from_polys(outline.to_image(curve.strips))
+            axes.add_patch(PathPatch(band, facecolor="C0", alpha=0.2, linewidth=0, label="95 % band"))
             axes.plot(*outline.to_image(curve.curve).T, color="C0", label="epipolar curve")
         if place is not None:
             axes.plot(*outline.to_image(place), "C3x", markersize=9, markeredgewidth=2, label="point")
