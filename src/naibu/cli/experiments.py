@@ -220,7 +220,7 @@ def _show(result: Identification) -> None:
     table = content.accuracy_table(calibration, result.baselines, result.left_out)
     print_table(table.title, table.columns, table.rows)
     names = content.shared_names(model)
-    rows = [(r.name, r.estimate, r.lower, r.upper, r.unit, r.note) for r in content.parameter_rows(model, names)]
+    rows = [(r.name, r.estimate, r.lower, r.upper, r.unit, r.remarks) for r in content.parameter_rows(model, names)]
     print_table("Parameters", ("parameter", "estimate", "95 % from", "to", "unit", "note"), rows, digits=4)
     for line in content.undetermined(model, names, calibration.priors):
         say(line, "dim")

@@ -171,8 +171,9 @@ def joint_model(
             notes.append(f"{met.capitalize()}; predictions of experiments count that in, smaller elements may lessen it.")
     predictive = None if markers.predictive is None else _predictive(markers, markers.predictive, found, joint, left**2 - own**2)
     of_markers = replace(
-        markers, parameters=parameters, covariance=covariance, predictive=predictive, reservation=_both(*doubts, markers.reservation)
-    )
+        markers, parameters=parameters, covariance=covariance, predictive=predictive, law_covariance=None,
+        reservation=_both(*doubts, markers.reservation),
+    )  # fmt: skip
     assert found.uncertainty is not None  # `told_by_fields` refuses it
     of_theta, own_fields = _finite(found.uncertainty.covariance)[1], told_by_fields(found)
     # in the scales of the joint estimate, which a linear step in theta would miss

@@ -11,6 +11,7 @@ import pytest
 from naibu import datasets
 from naibu.core.experiment import Experiment, Loading
 from naibu.identification.from_markers.calibration import initial_parameters
+from naibu.identification.from_markers.consider_parameters import with_considered
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import MarkerLoadCase, NoiseModel
@@ -23,7 +24,6 @@ from naibu.identification.from_markers.specimen.parameter_names import (
 )
 from naibu.identification.from_markers.specimen.resting_state import resting_state
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
-from naibu.identification.prediction.predictive_uncertainty import with_considered
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, virtual_specimen
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,6 @@ from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.calibrated_model import CalibratedModel
-from naibu.identification.prediction.predictive_uncertainty import PredictiveUncertainty
 from naibu.workflows.results.report_content import parameter_label, parameter_rows, search_sentence, undetermined
 
 
@@ -65,14 +65,21 @@ def test_what_is_said_of_a_parameter_agrees_with_its_interval(parameter: Paramet
     assert low <= parameter.value <= high
 
 
-def test_a_modulus_that_hangs_on_the_law_is_told_with_the_interval_that_does_not() -> None:
-    names = (MODULUS.name, "gel: c20_ratio")
-    for doubtful, told in ((0.3, True), (0.11, False)):
-        model = replace(model_of(MODULUS, 0.08), predictive=PredictiveUncertainty(names, np.diag([doubtful**2, 0.1]), 0.1, 1.0, {}))
+def test_a_modulus_that_hangs_on_the_law_has_the_interval_that_does_not_and_the_other_beside() -> None:
+    sure = model_of(MODULUS, 0.08)
+    for by_law, told in ((0.29, True), (0.05, False), (None, False)):
+        law = None if by_law is None else np.array([[by_law**2]])
+        model = replace(sure, covariance=sure.covariance + (0.0 if law is None else law), law_covariance=law)
+        (row,) = parameter_rows(model, [MODULUS.name])
         said = "".join(undetermined(model, [MODULUS.name]))
-        assert bool(said) == told, said
+        half = 1.959964 * np.hypot(0.08, by_law or 0.0)
+        assert (row.lower, row.upper) == pytest.approx((12.6 * np.exp(-half), 12.6 * np.exp(half)))
+        assert bool(row.beside) == ("model-form uncertainty" in said) == told
         if told:
-            assert "law (neo_hookean) is right" in said and "7 to 22.7 kPa" in said  # 12.6 exp(-+ 1.96 0.3)
+            assert row.beside == "10.77 to 14.74 if the law is exactly neo_hookean"  # 12.6 exp(-+ 1.96 0.08)
+        assert model.interval(MODULUS.name, law_exact=True) == pytest.approx(sure.interval(MODULUS.name))
+        again = CalibratedModel.from_dict(json.loads(json.dumps(model.to_dict())))
+        assert again.interval(MODULUS.name, law_exact=True) == model.interval(MODULUS.name, law_exact=True)
 
 
 def test_moduli_are_multiples_where_none_is_known() -> None:

@@ -43,6 +43,7 @@ BASE_SD_MM = 0.5  # of the height of the markers above the base
 GUESSED_BASE_SD_MM = 3.0  # the same where the markers' clearance in a dome is all that tells it
 PIXEL_SCALE_SD = 0.005  # a size printed with two digits, 0.29 mm for 0.293
 BATCH_SD = 0.3  # of ln(stiffness) between batches: the samples of one gel in Hirai et al. (2008), Table 3.4, have an SD of 0.2
+SHAPE_SD = {"c01_fraction": 0.5, "c20_ratio": 1.0, "c30_ratio": 1.0}
 TRUSTED_RATIO = (0.05, 20.0)  # of an unknown modulus to the known ones; the equilibrium gap is not used beyond
 
 
@@ -225,7 +226,7 @@ def _material_parameters(s: Specimen, known_materials: KnownMaterials, reference
         fixed, sd = (given is not None or alone) and not weighed, WEIGHED_SD if weighed else 2.0
         out.append(Parameter(young_modulus(m), given or reference, "kPa", "log", prior_sd=sd, fixed=fixed))
         out.append(Parameter(poisson_ratio(m), START_POISSON_RATIO, "", "incompressibility", prior_sd=1.0))
-        out += [Parameter(shape_parameter(m, k), 0.0, "", prior_sd=0.3) for k in SHAPE_NAMES.get(s.settings.law, ())]
+        out += [Parameter(shape_parameter(m, k), 0.0, "", prior_sd=SHAPE_SD[k]) for k in SHAPE_NAMES.get(s.settings.law, ())]
     return out
 
 

@@ -13,6 +13,7 @@ from naibu.core.errors import InputError
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.known_materials import KnownMaterials
+from naibu.identification.from_markers.law_uncertainty import LawUncertainty, law_uncertainty
 from naibu.identification.from_markers.observations import NoiseModel
 from naibu.identification.from_markers.specimen.parameter_names import young_modulus
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
@@ -35,7 +36,7 @@ class CalibratedModel:
     parameters : ParameterSet
         Estimated and given values, boundary conditions of the load cases included.
     covariance : ndarray, shape (p, p)
-        Of the free parameters on the optimiser's scale.
+        Second moment of the errors of the free parameters on the optimiser's scale: from noise, misfit, elements and the form of the law.
     noise : NoiseModel
         Of the measurement.
     noise_factor : float
@@ -50,6 +51,8 @@ class CalibratedModel:
         What the calibration leaves uncertain about other load cases.
     reservation : str
         What speaks against using the model, from the verdict on its identification; empty where nothing does.
+    law_covariance : ndarray, shape (p, p), optional
+        The part of `covariance` that stems from the form of the law; None where it was not told apart.
     """
 
     settings: ModelSettings
@@ -62,6 +65,7 @@ class CalibratedModel:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     predictive: PredictiveUncertainty | None = None
     reservation: str = ""
+    law_covariance: FloatArray | None = None
 
     @property
     def uncertainty(self) -> PredictiveUncertainty:
@@ -89,17 +93,19 @@ class CalibratedModel:
         return 1.0 / modulus, f"× {material}{p.unit.removeprefix('kPa')}"
 
     @classmethod
-    def of(cls, calibration: Calibration, provenance: Mapping[str, Any] | None = None) -> CalibratedModel:
-        """Take the model from a calibration."""
-        c = calibration
+    def of(
+        cls, calibration: Calibration, provenance: Mapping[str, Any] | None = None, law: LawUncertainty | None = None
+    ) -> CalibratedModel:
+        """Take the model from a calibration; `law` is what it owes to the law, where that is known already."""
+        c, by_law = calibration, law or law_uncertainty(calibration)
         labels = tuple(t.name for t in c.load_cases)
         return cls(
-            c.settings, c.match.parameters, c.covariance, c.noise, c.match.noise_factor, c.known_materials, labels, provenance or {},
-            predictive_uncertainty(c),
+            c.settings, c.match.parameters, c.covariance + by_law.covariance, c.noise, c.match.noise_factor, c.known_materials, labels,
+            provenance or {}, predictive_uncertainty(c, by_law.considered), law_covariance=by_law.covariance,
         )  # fmt: skip
 
-    def standard_deviation(self, name: str) -> float:
-        """Standard deviation of a parameter on the optimiser's scale; 0 where it was given.
+    def standard_deviation(self, name: str, *, law_exact: bool = False) -> float:
+        """Standard deviation of a parameter on the optimiser's scale, if `law_exact` with the law taken for right; 0 where it was given.
 
         Raises
         ------
@@ -108,18 +114,22 @@ class CalibratedModel:
         """
         free = [p.name for p in self.parameters.free]
         if name in free:
-            return float(np.sqrt(self.covariance[free.index(name), free.index(name)]))
+            k = free.index(name)
+            by_law = self.law_covariance[k, k] if law_exact and self.law_covariance is not None else 0.0
+            return float(np.sqrt(max(self.covariance[k, k] - by_law, 0.0)))
         if name in self.parameters.values():
             return 0.0
         raise InputError(f"the model has no parameter {name!r}; it has {', '.join(self.parameters.values())}")
 
-    def interval(self, name: str, width: float = 1.959964) -> tuple[float, float]:
+    def interval(self, name: str, width: float = 1.959964, *, law_exact: bool = False) -> tuple[float, float]:
         """Return the bounds of a parameter, `width` standard deviations about its estimate on the optimiser's scale (95 % by default).
+
+        They hold whichever law the material obeys; with `law_exact` those that hold if it obeys the law that was assumed.
 
         They respect physics: a Poisson's ratio is at least -1, and a positive parameter known to no power of `UNBOUNDED` has no bounds.
         """
         parameter = next(p for p in self.parameters if p.name == name)
-        centre, half = parameter.inner(parameter.value), min(width * self.standard_deviation(name), LARGEST_EXPONENT)
+        centre, half = parameter.inner(parameter.value), min(width * self.standard_deviation(name, law_exact=law_exact), LARGEST_EXPONENT)
         if parameter.scale == "log" and half > np.log(UNBOUNDED):
             return 0.0, np.inf
         low, high = sorted((parameter.physical(centre - half), parameter.physical(centre + half)))
@@ -147,6 +157,7 @@ class CalibratedModel:
             "load_cases": list(self.load_cases),
             "parameters": rows,
             "covariance": self.covariance.tolist(),
+            "law_covariance": None if self.law_covariance is None else self.law_covariance.tolist(),
             "predictive": None if self.predictive is None else self.predictive.to_dict(),
             "provenance": dict(self.provenance),
         }
@@ -166,12 +177,12 @@ class CalibratedModel:
         try:
             parameters = ParameterSet.of(Parameter(**(row | {"prior_sd": row["prior_sd"] or np.inf})) for row in data["parameters"])
             covariance = np.array(data["covariance"], dtype=float).reshape(len(parameters.free), len(parameters.free))
-            known, predictive = data["known"], data.get("predictive")
+            known, predictive, by_law = data["known"], data.get("predictive"), data.get("law_covariance")
             return cls(
                 ModelSettings(**data["settings"]), parameters, covariance, NoiseModel(**data["noise"]), float(data["noise_factor"]),
                 KnownMaterials(known["young_moduli"], known["scale_is_absolute"]), tuple(data["load_cases"]), data.get("provenance", {}),
                 None if predictive is None else PredictiveUncertainty.from_dict(predictive),
-                str(data.get("reservation", "")),
+                str(data.get("reservation", "")), None if by_law is None else np.array(by_law, dtype=float).reshape(covariance.shape),
             )  # fmt: skip
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"the model file is damaged or was written by another version ({error}); identify the model again") from error

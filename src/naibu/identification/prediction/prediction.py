@@ -11,6 +11,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.experiment import Experiment, State
 from naibu.core.parameters import Parameter
 from naibu.core.rigid_transform import registration
+from naibu.identification.from_markers.consider_parameters import with_considered
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.specimen.marker_grid import FILLED_SD_MM
 from naibu.identification.from_markers.specimen.parameter_names import platen_position
@@ -18,7 +19,7 @@ from naibu.identification.from_markers.specimen.specimen_model import Specimen, 
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.interval import coordinate_uncertainty
 from naibu.identification.prediction.platen_position import source_of_platen_position, stated_platen_position
-from naibu.identification.prediction.predictive_uncertainty import strain_at_markers, with_considered
+from naibu.identification.prediction.predictive_uncertainty import strain_at_markers
 from naibu.identification.prediction.solved_state import SolvedState, solve_state
 from naibu.identification.prediction.target_parameters import target_parameters
 

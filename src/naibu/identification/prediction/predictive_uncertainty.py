@@ -1,47 +1,22 @@
 """What a calibration leaves uncertain about other load cases: parameters, what was not sought, and the misfit of the model.
 
-Quantities that a calibration takes for known, though they are known only roughly, are *consider parameters*
-(:cite:p:`schmidt1966,tapley2004`): the curvature of the law, the friction of a surface on which an object merely lies, the size of a
-pixel. They are not estimated, but enter the covariance of everything that is, through their sensitivities and priors, and so widen the
-prediction of a state in which they count. The estimate that they would have moves the others; the square of that motion is part of the
-second moment that is kept. What the model still misses is a smooth discrepancy (:cite:p:`kennedy2001`), whose size and reach follow from
-the correlation of the residuals of neighbouring markers; data that share it count as one.
+The consider parameters of a calibration (`naibu.identification.from_markers.consider_parameters`) widen the prediction of a state in which
+they count. The estimate that they would have moves the others; the square of that motion is part of the second moment that is kept.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy.spatial import KDTree
-from scipy.spatial.distance import pdist, squareform
 
 from naibu.core.arrays import FloatArray
-from naibu.core.parameters import Parameter, ParameterSet
 from naibu.identification.from_markers.calibration import Calibration
-from naibu.identification.from_markers.gauss_newton import Matcher
-from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
-from naibu.identification.from_markers.specimen.parameter_names import (
-    SHAPE_NAMES,
-    friction,
-    pixel_scale,
-    shape_parameter,
-    straight_base,
-    young_modulus,
-)
+from naibu.identification.from_markers.consider_parameters import ELEMENTS, Considered, considered
+from naibu.identification.from_markers.observations import LoadCaseFit
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
-
-# standard deviations of what is taken for known, on the optimiser's scale
-SHAPE_SD: Mapping[str, float] = {"c01_fraction": 0.3, "c20_ratio": 0.3}
-FRICTION_SD = 1.0
-STRAIGHT_BASE_SD_MM = 1.0  # of a stated height, as of a mould
-STIFFNESS_SD = 0.7  # of the modulus of a gel whose scale is not known: its weight deforms it accordingly
-PIXEL_SCALE_SD = 0.005
-NEIGHBOURS = 1.3  # markers within this many spacings are neighbours
-LEAST_NOISE = 0.5  # times the stated noise
-REACH = 2.0  # of a smooth discrepancy, in spacings of the markers
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,100 +81,31 @@ class PredictiveUncertainty:
         )
 
 
-def with_considered(body: Specimen, parameters: ParameterSet) -> ParameterSet:
-    """Return the parameters of a specimen with those that were taken for known, and are not, free within their priors."""
-    have, experiment = parameters.values(), body.experiment
-    freed: dict[str, Parameter] = {}
-    new = [
-        Parameter(name, 0.0, "", prior_sd=sd)
-        for m in experiment.materials
-        for kind, sd in SHAPE_SD.items()
-        if kind not in SHAPE_NAMES.get(body.law.name, ()) and (name := shape_parameter(m, kind)) not in have
-    ]
-    if (name := pixel_scale(experiment)) not in have:
-        new.append(Parameter(name, experiment.xy_scale, "", prior_sd=PIXEL_SCALE_SD))
-    if experiment.loading.kind == "side_plates":
-        doubtful = {friction(layer.material, experiment.loading.base_material): FRICTION_SD for layer in experiment.layers}
-        if len(experiment.materials) == 1:
-            doubtful[young_modulus(experiment.materials[0])] = STIFFNESS_SD
-        if body.has_unknown_base:
-            doubtful[straight_base(experiment)] = STRAIGHT_BASE_SD_MM
-        freed = {
-            p.name: Parameter(p.name, p.value, p.unit, p.scale, prior_sd=doubtful[p.name])
-            for p in parameters
-            if p.fixed and p.name in doubtful
-        }
-    return ParameterSet.of([*parameters.changed(freed), *new])
-
-
-def predictive_uncertainty(calibration: Calibration) -> PredictiveUncertainty:
-    """Return what a calibration leaves uncertain about other load cases.
+def predictive_uncertainty(calibration: Calibration, known: Considered | None = None) -> PredictiveUncertainty:
+    """Return what a calibration leaves uncertain about other load cases; `known` are its consider parameters, once computed.
 
     Raises
     ------
     ConvergenceError
         The tangent at a solution is singular.
     """
-    match, load_cases = calibration.match, calibration.load_cases
-    parameters = match.parameters
-    for body in {t.specimen.experiment.name: t.specimen for t in load_cases}.values():
-        parameters = with_considered(body, parameters)
-    matcher = Matcher(load_cases, parameters)
-    fits = matcher.differentiated(match.fits, parameters.values())
-    equations = matcher.normal_equations(fits, parameters.start())
-    smooth = smooth_variance(load_cases, match.fits)
-    noise = np.mean([np.nanmean(np.where(np.isfinite(f.residual), f.sd**2, np.nan)) for f in match.fits])
-    white = max(LEAST_NOISE**2, match.noise_factor**2 - smooth / noise)
-    # a smooth discrepancy is seen once by all markers that share it; a misfit below the stated noise does not narrow the parameters
-    variance = max(1.0, white) + smooth / noise * float(np.mean([np.nanmean(_sharing(t)) for t in load_cases]))
-    names = [p.name for p in parameters.free]
-    prior = np.diag([1.0 / p.prior_sd**2 if np.isfinite(p.prior_sd) else 0.0 for p in parameters.free])
-    size = len(names)
-    hessian = equations.data / variance
-    hessian[:size, :size] += prior
-    covariance = np.linalg.inv(hessian)[:size, :size]
-    sought = {p.name for p in match.parameters.free}
-    pull = np.array([0.0 if n in sought else g for n, g in zip(names, equations.gradient, strict=False)])
-    shift = covariance @ pull / variance
+    c, match = known or considered(calibration), calibration.match
+    kept = np.array([name != ELEMENTS for name in c.names])
+    everything = np.ones(len(kept), dtype=bool)
+    shift = c.shift(everything)
+    moment = (c.covariance(everything) + np.outer(shift, shift))[np.ix_(kept, kept)]
+    names = tuple(name for name in c.names if name != ELEMENTS)
     states = {
         t.name: CalibratedState(t.specimen.experiment.loading.kind, strain_at_markers(t.specimen, match.parameters.values(), f))
-        for t, f in zip(load_cases, match.fits, strict=True)
+        for t, f in zip(calibration.load_cases, match.fits, strict=True)
     }
     steps = (
         {} if calibration.mesh is None else dict(zip((p.name for p in match.parameters.free), calibration.mesh.step.tolist(), strict=True))
     )
     return PredictiveUncertainty(
-        tuple(names), covariance + np.outer(shift, shift), float(np.sqrt(smooth)), float(np.sqrt(white)), states,
+        names, moment, float(np.sqrt(c.smooth_mm2)), c.noise_factor, states,
         tuple(steps.get(name, 0.0) for name in names) if steps else (),
     )  # fmt: skip
-
-
-def smooth_variance(load_cases: Sequence[MarkerLoadCase], fits: Sequence[LoadCaseFit]) -> float:
-    """Return the variance, mm2, of a residual that neighbouring markers share: the mean product of their residuals along each axis."""
-    total, count = 0.0, 0
-    for load_case, fit in zip(load_cases, fits, strict=True):
-        pairs = _neighbours(load_case.specimen.marker_points)
-        products = fit.residual[pairs[:, 0]] * fit.residual[pairs[:, 1]]
-        total += float(np.nansum(products))
-        count += int(np.isfinite(products).sum())
-    return max(0.0, total / count) if count else 0.0
-
-
-def _spacing(points: FloatArray) -> float:
-    """Median distance of a marker from the nearest other one, mm."""
-    distances = np.asarray(KDTree(points).query(points, 2)[0])
-    return float(np.median(distances[:, 1]))
-
-
-def _neighbours(points: FloatArray) -> FloatArray:
-    return np.asarray(KDTree(points).query_pairs(NEIGHBOURS * _spacing(points), output_type="ndarray"))
-
-
-def _sharing(load_case: MarkerLoadCase) -> FloatArray:
-    """Number of measured markers (k,) over which a smooth discrepancy is about the same; NaN for markers not measured."""
-    points, seen = load_case.specimen.marker_points, np.isfinite(load_case.measured).all(axis=1)
-    near = np.exp(-0.5 * (squareform(pdist(points)) / (REACH * _spacing(points))) ** 2)
-    return np.where(seen, near @ seen, np.nan)
 
 
 def strain_at_markers(body: Specimen, values: Mapping[str, float], fit: LoadCaseFit) -> float:

@@ -43,9 +43,21 @@ def check_stored_model(data: Mapping[str, Any]) -> None:
     rows = rows_of(data, "parameters")
     for row in rows:
         _check_parameter(row)
-    check_covariance(data.get("covariance"), [row["name"] for row in rows if not row["fixed"]])
+    free = [row["name"] for row in rows if not row["fixed"]]
+    check_covariance(data.get("covariance"), free)
+    if data.get("law_covariance") is not None:
+        _check_law_covariance(data["law_covariance"], len(free))
     if data.get("predictive") is not None:
         _check_predictive(table_of(data, "predictive"))
+
+
+def _check_law_covariance(rows: Any, size: int) -> None:
+    """Refuse anything but a table of numbers; parameters without influence of the law have rows of rounding errors, of any sign."""
+    table = isinstance(rows, list) and all(isinstance(row, list) and len(row) == size for row in rows) and len(rows) == size
+    require(table, "law_covariance", rows, f"must have {size} rows and columns, one per free parameter")
+    for row in rows:
+        for value in row:
+            require_number("law_covariance", value, -1e12, 1e12)
 
 
 def _check_predictive(predictive: Mapping[str, Any]) -> None:

@@ -70,8 +70,10 @@ def _card(row: ParameterRow) -> Card:
     if row.note or not (low or high):
         return Card(row.label, value, row.note or "not bounded by the data")
     if low and high:
-        return Card(row.label, value, f"95 %: {_plain(row.lower, width)} to {_plain(row.upper, width)}")
-    return Card(row.label, value, f"95 %: {f'above {_plain(row.lower, width)}' if low else f'below {_plain(row.upper, width)}'}")
+        interval = f"{_plain(row.lower, width)} to {_plain(row.upper, width)}"
+    else:
+        interval = f"above {_plain(row.lower, width)}" if low else f"below {_plain(row.upper, width)}"
+    return Card(row.label, value, f"95 %: {interval}{f'; {row.beside}' * bool(row.beside)}")
 
 
 def _plain(value: float, width: float) -> str:
@@ -98,7 +100,7 @@ def _parameter_row(row: ParameterRow, scale: _Scale) -> str:
     value = f"<strong>{_to_width(row.estimate, width)}</strong> [{low}, {high}]{unit}"
     name = escape(row.label) if row.label == row.name else f"{escape(row.label)} <code>{escape(row.name)}</code>"
     svg = f'<svg width="100%" height="20" aria-hidden="true">{_interval(row, scale)}</svg>'
-    return f'<tr><th scope="row">{name}</th><td>{value}</td><td class="plot">{svg}</td><td>{escape(row.note)}</td></tr>'
+    return f'<tr><th scope="row">{name}</th><td>{value}</td><td class="plot">{svg}</td><td>{escape(row.remarks)}</td></tr>'
 
 
 def _to_width(value: float, width: float) -> str:

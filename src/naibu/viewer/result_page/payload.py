@@ -151,7 +151,10 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class ParameterRow:
-    """An estimated parameter with its 95 % confidence interval; an infinite or NaN limit means that the data do not bound it."""
+    """An estimated parameter with its 95 % confidence interval; an infinite or NaN limit means that the data do not bound it.
+
+    A `note` tells why there is no interval, or where the value is from; `beside` is another interval, under a stricter assumption.
+    """
 
     name: str
     label: str
@@ -160,6 +163,12 @@ class ParameterRow:
     upper: float
     unit: str
     note: str = ""
+    beside: str = ""
+
+    @property
+    def remarks(self) -> str:
+        """Note, and the other interval, as one text."""
+        return "; ".join(filter(None, (self.note, self.beside)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,11 +19,12 @@ from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.checks.marker_checks import check_markers
 from naibu.identification.from_markers.checks.marker_outliers import Outlier, distrusted, outliers_of_fit, without_outliers
 from naibu.identification.from_markers.checks.verdict import verdict_of
+from naibu.identification.from_markers.law_uncertainty import law_uncertainty
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
 from naibu.identification.prediction.baselines import baselines_of
 from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.identification.prediction.cross_validation import LeftOut
-from naibu.identification.verdict import Verdict
+from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.linear_algebra.direct import use_one_thread
 from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_estimates
@@ -181,8 +182,11 @@ def identify(
         labels = [f"{e.name}/{s.name}" for e in loaded for s in _with_states(e, states or {}).loaded_states]
         one_of = "one of " * (len(labels) > 1) + ", ".join(labels)
         raise ConvergenceError(f"{one_of} cannot be solved with the starting values: {error}") from error
-    verdict = verdict_of(calibration, doubts, outliers, progress)
-    model = replace(CalibratedModel.of(calibration, provenance), reservation=verdict.reservation)
+    law = law_uncertainty(calibration)
+    verdict = verdict_of(calibration, doubts, outliers, progress, law)
+    # predictions count in what hangs on the law: that alone is nothing against the model
+    reservation = verdict.reservation if verdict.explanation is not Explanation.EXPLAINED else ""
+    model = replace(CalibratedModel.of(calibration, provenance, law), reservation=reservation)
     left_in_turn = [_with_states(e, states or {}) for e in loaded] if cross_validate else []
     result, trouble = _compared(calibration, model, verdict, left_in_turn, where, progress, kept)
     if folder is not None:

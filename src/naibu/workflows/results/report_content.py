@@ -13,6 +13,7 @@ from naibu.core.experiment import Experiment
 from naibu.core.parameters import Parameter, ParameterSet
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.checks.assumed_law import HANGING, HANGS
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
 from naibu.identification.prediction.calibrated_model import CalibratedModel
@@ -27,7 +28,6 @@ from naibu.viewer.tables import Cell, Table
 
 _ACCURACY_COLUMNS = ("experiment/state", "markers", "x mm", "y mm", "z mm", "3-D mm", "in noise units")
 INCOMPRESSIBLE, NOT_VERY_COMPRESSIBLE = 0.499, 0.3  # Poisson's ratios
-BY_LAW = 1.5  # times its standard deviation: a modulus that is so much less certain if the law is not taken for right
 WEAK = 0.6  # of the width of the prior: an interval as wide as that owes little to the data
 LABELS: Mapping[str, str] = {
     "young_modulus": "Young's modulus",
@@ -207,7 +207,8 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
             low = -np.inf if np.isinf(high) else low
             note = "" if not p.fixed else ("given" if model.reference is None else "sets the scale: moduli are ratios to it")
             factor, unit = model.shown(p)
-            rows.append(ParameterRow(p.name, parameter_label(p.name), factor * p.value, factor * low, factor * high, unit, note))
+            beside = _by_law(p, model)
+            rows.append(ParameterRow(p.name, parameter_label(p.name), factor * p.value, factor * low, factor * high, unit, note, beside))
     return tuple(rows)
 
 
@@ -246,25 +247,22 @@ def _undetermined(p: Parameter, model: CalibratedModel, assumed: Parameter | Non
         return f"the data hardly determine it; {factor * p.value:.3g} {unit}".rstrip() + f" was found{before}."
     if p.name.endswith("friction") and high > 4.0 * p.value:
         return f"known only to lie between {low:.2g} and {high:.2g}; where surfaces do not slip, a larger friction looks the same."
-    return _by_law(p, model, sd) if p.name.endswith("young_modulus") and p.scale == "log" else ""
+    if p.name.endswith(HANGING) and _by_law(p, model):
+        return (
+            "its interval counts in that the material may stiffen more or less with strain than the law says (model-form uncertainty). "
+            "'naibu compare' tells whether another law fits better."
+        )
+    return ""
 
 
-def _by_law(p: Parameter, model: CalibratedModel, sd: float) -> str:
-    """What the interval of a modulus takes for right: the curvature of the law above all, which a prediction takes for uncertain."""
-    names = [] if model.predictive is None else list(model.predictive.names)
-    if model.predictive is None or p.name not in names:
+def _by_law(p: Parameter, model: CalibratedModel) -> str:
+    """The interval that a parameter would have if the law were exactly right, where the law makes it much wider."""
+    exact = model.standard_deviation(p.name, law_exact=True)
+    if not exact or model.standard_deviation(p.name) < HANGS * exact:
         return ""
-    k = names.index(p.name)
-    doubtful = float(np.sqrt(model.predictive.covariance[k, k]))
-    if doubtful < BY_LAW * sd:
-        return ""
-    (factor, unit), half = model.shown(p), 1.959964 * doubtful
-    low, high = (factor * p.value * float(np.exp(side * half)) for side in (-1.0, 1.0))
-    return (
-        f"its interval holds if the law ({model.settings.law}) is right; with as uncertain a curvature of the law as beforehand it is "
-        f"{low:.3g} to {high:.3g} {unit}".rstrip()
-        + ". 'naibu compare' tells whether another law fits better."
-    )
+    factor, _ = model.shown(p)
+    low, high = (factor * bound for bound in model.interval(p.name, law_exact=True))
+    return f"{low:.4g} to {high:.4g} if the law is exactly {model.settings.law}"
 
 
 def build_report(

@@ -194,7 +194,11 @@ def _identification_summary(
 
 def _estimate(model: CalibratedModel, p: Parameter) -> dict[str, Any]:
     (low, high), (factor, unit) = model.interval(p.name), model.shown(p)
-    return {"estimate": factor * p.value, "from": factor * low, "to": factor * high, "unit": unit}
+    told = {"estimate": factor * p.value, "from": factor * low, "to": factor * high, "unit": unit}
+    if model.law_covariance is None:
+        return told
+    low, high = model.interval(p.name, law_exact=True)
+    return told | {"from_if_law_exact": factor * low, "to_if_law_exact": factor * high}
 
 
 def _figures(a: Accuracy) -> dict[str, float | int]:

@@ -3,13 +3,13 @@
 A search that converged has found a minimum, which says nothing about how low it is. The verdict weighs what tells data apart that the model
 cannot explain: the residuals in units of the noise, how much of the deformation they leave unexplained, whether an affine map does as well,
 the part of the residuals that neighbours share (noise is not shared), estimates far from what was known beforehand, heights of indenters
-and layers that contradict the stated ones, and experiments that contradict each other.
+and layers that contradict the stated ones, experiments that contradict each other, and markers that ask for another law.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,10 +19,12 @@ from naibu.core.progress import Progress
 from naibu.core.rigid_transform import registration
 from naibu.core.status import Status
 from naibu.identification.from_markers.calibration import Calibration
+from naibu.identification.from_markers.checks.assumed_law import contradicted_law, hangs_on_law
 from naibu.identification.from_markers.checks.contradicting_experiments import contradicted_experiments
 from naibu.identification.from_markers.checks.layer_heights import LAYER, contradicted_layers
 from naibu.identification.from_markers.checks.marker_checks import Doubt, robust_affine
 from naibu.identification.from_markers.checks.marker_outliers import Outlier
+from naibu.identification.from_markers.law_uncertainty import LawUncertainty, law_uncertainty
 from naibu.identification.from_markers.mesh_error import RATIO, STIFFNESSES
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase
 from naibu.identification.from_markers.specimen.parameter_names import platen_position
@@ -105,7 +107,11 @@ class _Flaw:
 
 
 def verdict_of(
-    calibration: Calibration, doubts: Sequence[Doubt] = (), outliers: Sequence[Outlier] = (), progress: Progress | None = None
+    calibration: Calibration,
+    doubts: Sequence[Doubt] = (),
+    outliers: Sequence[Outlier] = (),
+    progress: Progress | None = None,
+    law: LawUncertainty | None = None,
 ) -> Verdict:
     """Return the verdict on a calibration.
 
@@ -119,14 +125,25 @@ def verdict_of(
         Markers that were left out.
     progress : callable, optional
         Gets reports where experiments seem to contradict each other, and are identified each by itself.
+    law : LawUncertainty, optional
+        What the estimates owe to the law, where it is known already.
     """
     match = calibration.match
     values = match.parameters.values()
     cases = [_evidence(t, f, values) for t, f in zip(calibration.load_cases, match.fits, strict=True)]
-    doubts = (*contradicted_experiments(calibration, progress), *doubts, *coarse_elements(calibration), *contradicted_layers(calibration))
+    of_law = law or law_uncertainty(calibration)
+    against = contradicted_law(calibration, of_law)
+    apart, coarse = contradicted_experiments(calibration, progress), coarse_elements(calibration)
+    doubts = (*apart, *against, *doubts, *coarse, *contradicted_layers(calibration))
     deviations = prior_deviations(match.parameters, calibration.priors)
     others = {name: d for name, d in deviations.items() if LAYER not in name}
-    return verdict(cases, others, match.noise_factor, match.status, doubts, outliers)
+    judged = verdict(cases, others, match.noise_factor, match.status, doubts, outliers)
+    hangs = hangs_on_law(calibration, of_law)
+    if against or not hangs:
+        return judged
+    if judged.explanation is Explanation.EXPLAINED:
+        return replace(judged, limits=hangs)
+    return replace(judged, notes=(*judged.notes, f"{hangs[0].upper()}{hangs[1:]}."))
 
 
 def coarse_elements(calibration: Calibration) -> tuple[Doubt, ...]:
