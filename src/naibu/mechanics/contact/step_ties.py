@@ -4,7 +4,10 @@ Facets follow an oblique blade in steps, and the contact of the two sides presse
 along the blade, which in a nearly incompressible solid between walls is as large as that across it, acts on the fronts of the steps: as
 they are not faces of the body that the blade makes, but a matter of its mesh, they hold together as long as the sides touch. Each pair of
 nodes has a spring along the vector area of its facets in the plane of the blade, which resists that its slip differs from the mean of
-those of its neighbours: sides slide past each other freely, and a level cut has no ties.
+those of its neighbours: sides slide past each other freely, and a level cut has no ties. Where one of these pairs is open, nothing holds
+the step together, and there is no tie. In time steps, springs are as stiff as the penalty only from where the pressure is the shear
+modulus, as iterations with tangents of earlier states take longer where stiffness comes and goes; their forces go on from step to step,
+and what they hand over is that of stiff ones a few steps later.
 """
 
 from __future__ import annotations
@@ -16,8 +19,9 @@ import numpy as np
 from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact._cut_lip_kernels import RAMP, add_facets
-from naibu.mechanics.contact.cut_lips import CutLips
+from naibu.mechanics.contact.cut_lips import STIFFNESS, CutLips
 
+YIELDING = 1.0 / (3.0 * STIFFNESS)  # of the edge: penetration of pairs whose penalty exerts the shear modulus
 LEAST_STEP = 1e-2  # of the area of a pair along the normal: what its facets have along the blade, from which it is tied
 
 
@@ -33,21 +37,31 @@ class StepTies:
         Nodes that it concerns, of which the last may be repeated.
     shares : ndarray, shape (m, k)
         What the positions of these nodes contribute to how the slip of the pair differs from that around it; 0 for repeated nodes.
+    around : ndarray, shape (m, j), int64
+        These pairs, of which the first may be repeated.
     corners : ndarray, shape (2 f, 3), int64
         Tied pair at every corner of the triangles of the sides, or -1.
+    ramp : float
+        Penetration of the pairs, over the edge, over which the springs become as stiff as the penalty.
     along : ndarray, shape (m, 3), optional
         Unit vectors of the springs at the beginning of a time step, times the root of their stiffness, mN/mm; by default they are those
         of the displacement.
+    tensions : ndarray, shape (m,), optional
+        Forces of the springs, mN, where the slip is that around them: the multipliers of an augmented Lagrangian
+        :cite:p:`wriggers2006`; 0 by default.
     """
 
     own: IntArray
     nodes: IntArray
     shares: FloatArray
+    around: IntArray
     corners: IntArray
+    ramp: float = YIELDING
     along: FloatArray | None = None
+    tensions: FloatArray | None = None
 
     def springs(self, lips: CutLips, displacement: FloatArray) -> FloatArray:
-        """Return the springs (m, 3) at a displacement (n, 3), mm: zero for pairs that do not touch."""
+        """Return the springs (m, 3) at a displacement (n, 3), mm: zero where one of the pairs does not touch."""
         gap, normal = lips.gaps_and_normals(displacement)
         sides = np.zeros((2, len(lips.pairs), 3))
         add_facets(lips.points + displacement, lips.faces, lips.pairs, self.corners, sides)
@@ -55,18 +69,37 @@ class StepTies:
         normal = normal[self.own]
         area -= (area * normal).sum(axis=1, keepdims=True) * normal
         size = np.linalg.norm(area, axis=1)
-        touching = np.clip(-gap[self.own] / (RAMP * lips.edge[self.own]), 0.0, 1.0)
+        touching = np.clip(-gap[self.around].max(axis=1) / (self.ramp * lips.edge[self.own]), 0.0, 1.0)
         stiffness = touching * lips.stiffness[self.own] / np.where(size > 0.0, size, 1.0)
         return np.asarray(area * np.sqrt(stiffness)[:, None])
+
+    def unyielding(self) -> StepTies:
+        """Return the same ties, as stiff as the penalty wherever pairs touch."""
+        return replace(self, ramp=RAMP)
 
     def in_step(self, lips: CutLips, displacement: FloatArray) -> StepTies:
         """Return the ties of a time step that begins at a displacement (n, 3), mm: those of pairs that touch there."""
         return replace(self, along=self.springs(lips, displacement))
 
+    def with_tensions(self, tensions: FloatArray | None) -> StepTies:
+        """Return the same ties whose springs exert these forces (m,), mN, where the slip is that around them; None for none."""
+        return replace(self, tensions=tensions)
+
+    def tensions_behind(self, lips: CutLips, displacement: FloatArray) -> FloatArray:
+        """Return the forces (m,), mN, of the springs at a displacement (n, 3), mm, with which the next step goes on."""
+        along = self.springs(lips, displacement) if self.along is None else self.along
+        slip = np.einsum("mk,mi,mki->m", self.shares, along, (lips.points + displacement)[self.nodes])
+        return np.asarray(np.linalg.norm(along, axis=1) * (slip + self._begun(along)))
+
+    def _begun(self, along: FloatArray) -> FloatArray:
+        """Return the tensions (m,) over the root of the stiffness of the springs."""
+        root = np.linalg.norm(along, axis=1)
+        return np.zeros(len(along)) if self.tensions is None else self.tensions / np.where(root > 0.0, root, np.inf)
+
     def add(self, lips: CutLips, displacement: FloatArray, force: FloatArray, positions: Int32Array, blocks: FloatArray) -> float:
         """Add to internal forces (n, 3), mN, and to `blocks`, where there are any, at `positions` (m, k, k); return the energy, mN mm."""
         along = self.springs(lips, displacement) if self.along is None else self.along
-        return float(_pulled(self.nodes, self.shares, along, lips.points + displacement, force, positions, blocks))
+        return float(_pulled(self.nodes, self.shares, along, self._begun(along), lips.points + displacement, force, positions, blocks))
 
 
 def step_ties(lips: CutLips) -> StepTies | None:
@@ -94,15 +127,16 @@ def step_ties(lips: CutLips) -> StepTies | None:
         return None
     first = np.concatenate([[0], np.cumsum(many)])
     nodes = np.repeat(lips.pairs[own][:, :1], 2 * (1 + int(many[own].max())), axis=1)
-    shares = np.zeros(nodes.shape)
+    shares, members = np.zeros(nodes.shape), np.repeat(own[:, None], nodes.shape[1] // 2, axis=1)
     for row, p in enumerate(own):
         others = around[first[p] : first[p + 1], 1]
         pairs = np.concatenate([[p], others])
         weight = lips.area[pairs] / lips.area[pairs].sum()
         share = np.where(pairs == p, 1.0 - weight, -weight) * np.sign(normal[pairs] @ normal[p])  # which of two sides is the first differs
+        members[row, : len(pairs)] = pairs
         nodes[row, : 2 * len(pairs)] = lips.pairs[pairs].ravel()
         shares[row, : 2 * len(pairs)] = np.stack([-share, share], axis=1).ravel()
-    return StepTies(own.astype(np.int64), nodes, shares, corners)
+    return StepTies(own.astype(np.int64), nodes, shares, members, corners)
 
 
 def _neighbours(corners: IntArray, count: int) -> IntArray:
@@ -113,13 +147,13 @@ def _neighbours(corners: IntArray, count: int) -> IntArray:
 
 
 @njit(cache=True, nogil=True)
-def _pulled(nodes, shares, along, at, force, positions, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
+def _pulled(nodes, shares, along, begun, at, force, positions, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add the internal forces of ties, and their stiffness; returns the energy."""
     energy, k = 0.0, nodes.shape[1]
     for t in range(len(nodes)):
         if along[t, 0] == 0.0 and along[t, 1] == 0.0 and along[t, 2] == 0.0:
             continue
-        s = 0.0
+        s = begun[t]
         for a in range(k):
             for i in range(3):
                 s += shares[t, a] * along[t, i] * at[nodes[t, a], i]

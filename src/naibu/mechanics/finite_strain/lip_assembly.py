@@ -24,8 +24,7 @@ class LipAssembler(Assembler):
     secant : bool
         Whether the tangent contains the secant of friction instead of its derivative, and is symmetric then.
     ties : StepTies, optional
-        Springs between the steps in which their facets follow an oblique blade. They act in static solutions; iterations with tangents of
-        earlier states take twice as long with them.
+        Springs between the steps in which their facets follow an oblique blade.
     """
 
     lips: CutLips | None = None
@@ -57,6 +56,8 @@ class LipAssembler(Assembler):
         """Add the forces of lips in contact to internal forces (n, 3), mN."""
         if self.lips is not None:
             self.lips.add(displacement, force)
+            if self.ties is not None:
+                self.ties.add(self.lips, displacement, force, np.empty((0, 0, 0), np.int32), np.empty((0, 3, 3)))
 
     def _run(self, displacement: FloatArray, parameters: FloatArray, blocks: FloatArray) -> tuple[float, FloatArray, float]:
         energy, force, smallest = Assembler._run(self, displacement, parameters, blocks)
@@ -77,11 +78,36 @@ def lips_of(assembler: Assembler) -> tuple[CutLips, ...]:
     return (assembler.lips,) if isinstance(assembler, LipAssembler) and assembler.lips is not None else ()
 
 
-def with_overlaps(assembler: Assembler, overlaps: FloatArray | None) -> Assembler:
-    """Return the assembler whose sides of cuts exert no pressure at gaps (p,), mm; None: at none."""
-    if overlaps is None or not isinstance(assembler, LipAssembler) or assembler.lips is None:
+@dataclass(frozen=True, slots=True, eq=False)
+class LipMultipliers:
+    """What the sides of cuts exert at the beginning of a time step: the multipliers of an augmented Lagrangian :cite:p:`wriggers2006`.
+
+    Attributes
+    ----------
+    overlaps : ndarray, shape (p,), optional
+        See `naibu.mechanics.contact.cut_lips.CutLips`.
+    tensions : ndarray, shape (m,), optional
+        See `naibu.mechanics.contact.step_ties.StepTies`.
+    """
+
+    overlaps: FloatArray | None
+    tensions: FloatArray | None
+
+
+def with_multipliers(assembler: Assembler, multipliers: LipMultipliers | None) -> Assembler:
+    """Return the assembler whose sides of cuts exert this at the beginning of a step; None: nothing."""
+    if multipliers is None or not isinstance(assembler, LipAssembler) or assembler.lips is None:
         return assembler
-    return replace(assembler, lips=assembler.lips.with_overlaps(overlaps))
+    ties = None if assembler.ties is None else assembler.ties.with_tensions(multipliers.tensions)
+    return replace(assembler, lips=assembler.lips.with_overlaps(multipliers.overlaps), ties=ties)
+
+
+def multipliers_behind(assembler: Assembler, displacement: FloatArray) -> LipMultipliers | None:
+    """Return with what the sides of cuts go on from a displacement (n, 3), mm, at the end of a step; None where penalties suffice."""
+    if not isinstance(assembler, LipAssembler) or assembler.lips is None or not (assembler.lips.yields or assembler.ties is not None):
+        return None
+    overlaps = assembler.lips.overlaps_behind(displacement) if assembler.lips.yields else None
+    return LipMultipliers(overlaps, None if assembler.ties is None else assembler.ties.tensions_behind(assembler.lips, displacement))
 
 
 def going_on(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
@@ -98,16 +124,10 @@ def with_secant(assembler: Assembler, anchors: FloatArray | None) -> Assembler:
 
 
 def with_unyielding_lips(assembler: Assembler) -> Assembler:
-    """Return the assembler whose sides of cuts have their largest penalties, and ties; the same where there is no cut."""
+    """Return the assembler whose sides of cuts, and ties, have their largest penalties; the same where there is no cut."""
     if not isinstance(assembler, LipAssembler) or assembler.lips is None:
         return assembler
-    stiff = replace(assembler, lips=assembler.lips.unyielding())
-    if stiff.ties is None:
-        return stiff
-    coupled = stiff.with_couplings(stiff.ties.nodes)
-    pattern = coupled.pattern
-    assert isinstance(coupled, LipAssembler)
-    return replace(coupled, _pairs=pattern.positions(assembler.lips.pairs), _tied=pattern.positions(stiff.ties.nodes))
+    return replace(assembler, lips=assembler.lips.unyielding(), ties=None if assembler.ties is None else assembler.ties.unyielding())
 
 
 def with_friction(assembler: Assembler, coefficient: float) -> Assembler:
@@ -156,6 +176,8 @@ def with_lips(
     if lips is None:
         return assembler
     lips = lips.with_friction(friction)
-    coupled = assembler.with_couplings(lips.pairs)
+    ties = step_ties(lips)
+    coupled = assembler.with_couplings(lips.pairs, *(() if ties is None else (ties.nodes,)))
     known = {f.name: getattr(coupled, f.name) for f in fields(Assembler)}
-    return LipAssembler(**known, lips=lips, ties=step_ties(lips), _pairs=coupled.pattern.positions(lips.pairs))
+    tied = None if ties is None else coupled.pattern.positions(ties.nodes)
+    return LipAssembler(**known, lips=lips, ties=ties, _pairs=coupled.pattern.positions(lips.pairs), _tied=tied)

@@ -24,7 +24,14 @@ from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotio
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.assembly import Assembler
-from naibu.mechanics.finite_strain.lip_assembly import lips_of, with_friction, with_overlaps, with_secant
+from naibu.mechanics.finite_strain.lip_assembly import (
+    LipMultipliers,
+    lips_of,
+    multipliers_behind,
+    with_friction,
+    with_multipliers,
+    with_secant,
+)
 from naibu.mechanics.finite_strain.penalties import node_shear_moduli, relative_penetrations, stiff_enough, with_less_penetration
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.indenter_session import IndenterSession
@@ -59,9 +66,9 @@ class DynamicState:
         Penalties of the contacts, kPa/mm, as stiff as they had to be so far; empty: those of the engine.
     lips : ndarray, shape (p, 3), optional
         Frictional anchors of the sides of cuts, mm; those at rest by default.
-    overlaps : ndarray, shape (p,), optional
-        Gaps, mm, at which the sides of cuts begin to press: pressures go on from step to step, as the multipliers of an augmented
-        Lagrangian, where penalties would yield to those in a nearly incompressible body between walls.
+    multipliers : LipMultipliers, optional
+        Pressures across the sides of cuts, and along their steps, which go on from step to step where penalties would yield to those in a
+        nearly incompressible body between walls.
     """
 
     displacement: FloatArray
@@ -71,7 +78,7 @@ class DynamicState:
     anchors: tuple[FloatArray, ...] = ()
     normal_stiffness: tuple[FloatArray, ...] = ()
     lips: FloatArray | None = None
-    overlaps: FloatArray | None = None
+    multipliers: LipMultipliers | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -329,17 +336,14 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
         centres = np.array([c.stop for c in contacts]).reshape(-1, 3)
         penalties = tuple(c.normal_stiffness for c in contacts)
         moved, turns = (u - start.displacement) / h, turned(start.rotations, h * spin)
-        slipped, overlaps = None, None
-        for lips in lips_of(self.engine.assembler):
-            if lips.friction > 0.0 or lips.yields:
-                own = next(iter(lips_of(self._assembler().in_step(start.displacement, start.lips))))
-                slipped = own.anchors_behind(u) if lips.friction > 0.0 else None
-                overlaps = own.overlaps_behind(u) if lips.yields else None
-        return DynamicState(u, moved, centres, turns, anchors, penalties, slipped, overlaps)
+        own, slipped = self._assembler().in_step(start.displacement, start.lips), None
+        for lips in lips_of(own):
+            slipped = lips.anchors_behind(u) if lips.friction > 0.0 else None
+        return DynamicState(u, moved, centres, turns, anchors, penalties, slipped, multipliers_behind(own, u))
 
     def _assembler(self) -> Assembler:
         """Return the assembler of the next step: the sides of cuts press as they did at the end of the last one."""
-        return with_overlaps(self.engine.assembler, self.reached.overlaps)
+        return with_multipliers(self.engine.assembler, self.reached.multipliers)
 
     def _contacts(self, h: float, along: FloatArray, spin: FloatArray) -> tuple[Contact, ...]:
         """Contacts whose bodies move from where they are for a time `h`."""

@@ -9,7 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
-from naibu.mechanics.finite_strain.lip_assembly import lips_of, with_overlaps, with_secant
+from naibu.mechanics.finite_strain.lip_assembly import LipMultipliers, lips_of, with_multipliers, with_secant
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool
@@ -66,7 +66,7 @@ def _mean_edges(points: FloatArray, faces: IntArray) -> FloatArray:
 
 def tangent_at(
     engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: IntArray, ahead: IntArray, slipped: FloatArray | None,
-    overlaps: FloatArray | None,
+    begun: LipMultipliers | None,
 ) -> EarlierTangent:  # fmt: skip
     """Return the tangent at a displacement, and columns of its inverse for the nodes that come into contact.
 
@@ -84,10 +84,10 @@ def tangent_at(
         Nodes in contact or about to be.
     slipped : ndarray, shape (p, 3), optional
         Frictional anchors of the sides of cuts, mm; by default those at rest.
-    overlaps : ndarray, shape (p,), optional
-        Gaps, mm, at which the sides of cuts begin to press; 0 by default.
+    begun : LipMultipliers, optional
+        What the sides of cuts exerted when the step began; nothing by default.
     """
-    assembler = with_secant(with_overlaps(engine.assembler, overlaps), slipped)
+    assembler = with_secant(with_multipliers(engine.assembler, begun), slipped)
     pattern, blocks = assembler.pattern, assembler.evaluate(u)[2]
     contact = np.zeros((engine._surface.n_blocks, 3, 3))
     for some, place, all_places in zip(*contacts, strict=False):

@@ -119,7 +119,7 @@ class RealTimeSession(NewtonSession):
         """Go on from a state; see `DynamicSession.restore`."""
         DynamicSession.restore(self, state)
         self._pressure, self._near, self._gaps, self._trial, self._search = None, (), (), None, None
-        self._slipped, self._overlaps = self.reached.lips, self.reached.overlaps
+        self._slipped, self._begun = self.reached.lips, self.reached.multipliers
 
     @property
     def under_way(self) -> bool:
@@ -401,7 +401,7 @@ class RealTimeSession(NewtonSession):
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
-        trial, self._slipped, self._overlaps = self._trial, self.reached.lips, self.reached.overlaps
+        trial, self._slipped, self._begun = self._trial, self.reached.lips, self.reached.multipliers
         self.unbalanced = 0.0 if trial is None else trial.unbalanced
         if trial is None:
             return DynamicSession._accepted(self, h, u, contacts, spin)

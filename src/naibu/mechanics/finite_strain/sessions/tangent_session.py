@@ -11,6 +11,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.finite_strain.lip_assembly import LipMultipliers
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
 from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
@@ -43,7 +44,7 @@ class TangentSession(DynamicSession):
     _seen: FloatArray | None = field(init=False, default=None)
     _age: int = field(init=False, default=0)
     _slipped: FloatArray | None = field(init=False, default=None)  # anchors of the sides of cuts when the last step began
-    _overlaps: FloatArray | None = field(init=False, default=None)  # and the gaps at which they began to press
+    _begun: LipMultipliers | None = field(init=False, default=None)  # and what they exerted
     _until: float = field(init=False, default=np.inf)  # processor time at which a step is left to the next call
 
     def keep_tangent(self) -> None:
@@ -59,7 +60,7 @@ class TangentSession(DynamicSession):
             some.add_force(u, np.zeros_like(u))
         touching = tuple(some.touching() for some in near)
         ahead = self._soon_touched(contacts, [some.gap for some in near])
-        self._engine._rest[:] = [self._made(u, touching, self._places, self._held(), ahead, self._slipped, self._overlaps)]
+        self._engine._rest[:] = [self._made(u, touching, self._places, self._held(), ahead, self._slipped, self._begun)]
 
     def close(self) -> None:
         """End the thread and release the factors."""
@@ -111,9 +112,9 @@ class TangentSession(DynamicSession):
             return
         self._seen = u
         if self._engine.background:
-            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped, self._overlaps))
+            self._thread.submit(partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped, self._begun))
         else:
-            self._keep(self._made(u, self._near, self._places, self._held(), ahead, self._slipped, self._overlaps))
+            self._keep(self._made(u, self._near, self._places, self._held(), ahead, self._slipped, self._begun))
 
     def _renewed(self) -> Generator[None, None, EarlierTangent]:
         """Return the tangent of the state reached, which the step waits for; the thread makes it where there is no time."""
@@ -124,7 +125,7 @@ class TangentSession(DynamicSession):
             gaps.append(np.full(len(contact.nodes), np.inf))
             gaps[-1][near.points] = near.gap
         ahead = self._soon_touched(self._templates, gaps)
-        make = partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped, self._overlaps)
+        make = partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped, self._begun)
         if not self._engine.background or self._until == np.inf:
             return self._used(self._keep(make()))
         while not self._thread.idle:
@@ -166,14 +167,14 @@ class TangentSession(DynamicSession):
         held: IntArray,
         ahead: IntArray,
         slipped: FloatArray | None,
-        overlaps: FloatArray | None,
+        begun: LipMultipliers | None,
     ) -> EarlierTangent:
         """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`.
 
         Of sides of cuts that slide, its secant is that of a step that began with these anchors: at the end of a step they have slipped.
         Those that press do so as in this step.
         """
-        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead, slipped, overlaps)
+        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead, slipped, begun)
 
     def _release(self, tangent: EarlierTangent | None) -> None:
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
