@@ -12,7 +12,7 @@ Noise is normal, independent at every point, and given as a fraction of the larg
 `unseen` measure the nodes of the mesh that made the data and use its elements as given, as the report does: they show what noise does, and
 nothing of the errors of elements. `inclusion` and `large` measure a grid of points in a body that was solved on a finer mesh; `coverage`,
 `tetrahedra` and `surface`, random points in bodies that were solved by other code. Every row ends with the goal and whether it was met.
-`coverage --record` writes ``results/field_identification.json``.
+`coverage --record` writes ``results/field_identification.json``, `surface --record` ``results/field_identification_surface.json``.
 """
 
 from __future__ import annotations
@@ -297,6 +297,7 @@ STUDIES: dict[str, Callable[[int, int], ResultTable | None]] = {
     "elements": elements, "regions": regions, "unseen": unseen, "inclusion": inclusion, "large": large, "coverage": coverage,
     "tetrahedra": tetrahedra, "surface": surface,
 }  # fmt: skip
+RECORDS = {"coverage": "field_identification", "surface": "field_identification_surface"}
 
 
 def main() -> None:
@@ -305,13 +306,14 @@ def main() -> None:
     parser.add_argument("studies", nargs="*", help=f"any of {', '.join(STUDIES)}; all by default")
     parser.add_argument("--seeds", type=int, default=20, help="draws of noise in `elements` and `unseen`")
     parser.add_argument("--repetitions", type=int, default=100, help="draws of noise in `regions`")
-    parser.add_argument("--record", action="store_true", help="write results/field_identification.json, with `coverage`")
+    parser.add_argument("--record", action="store_true", help="write the tables of `coverage` and `surface`")
     chosen = parser.parse_args()
-    if chosen.record and "coverage" not in chosen.studies:
-        parser.error("--record goes with the study `coverage`")
-    tables = [STUDIES[name](chosen.seeds, chosen.repetitions) for name in chosen.studies or STUDIES]
-    if chosen.record:
-        write_record("field_identification", [table for table in tables if table is not None])
+    if chosen.record and not set(RECORDS) & set(chosen.studies):
+        parser.error(f"--record goes with the studies {' and '.join(RECORDS)}")
+    for name in chosen.studies or STUDIES:
+        table = STUDIES[name](chosen.seeds, chosen.repetitions)
+        if chosen.record and table is not None and name in RECORDS:
+            write_record(RECORDS[name], [table])
 
 
 if __name__ == "__main__":

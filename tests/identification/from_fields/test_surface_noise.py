@@ -14,7 +14,7 @@ from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, moduli_of
 from naibu.identification.from_fields.mesh_error import changes_of_motions, changes_on_finer_mesh, refitted
-from naibu.identification.from_fields.surface_noise import CorrectedInformation, DrawnMotions
+from naibu.identification.from_fields.surface.noise import CorrectedInformation, DrawnMotions
 from naibu.identification.from_fields.uncertainty import intervals
 from naibu.identification.from_fields.verdict import FEW_POINTS
 

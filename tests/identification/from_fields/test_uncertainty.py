@@ -31,6 +31,19 @@ from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
 PRESS, SHEAR = (0.0, 0.0, -10.0), (7.0, 0.0, -7.0)
 
 
+def test_bounds_of_a_skew_modulus_lie_where_it_says() -> None:
+    theta, sides = np.log([[2.0], [12.0]]).ravel(), np.array([[3.0], [1.0]])
+    found = Uncertainty(np.diag([100.0, 400.0]), np.diag([0.01, 0.0]))
+    skew = found.with_sides(sides)
+    (young, even), ln = (intervals(theta, one)[0][0] for one in (skew, found)), np.log
+    middle = young_and_poisson(theta)[0][0]
+    np.testing.assert_allclose(ln(middle / young[0]), 3.0 * ln(middle / even[0]))
+    np.testing.assert_allclose(ln(young[1] / middle), ln(even[1] / middle))
+    np.testing.assert_allclose(skew.of_young_and_poisson(theta)[0], 0.2)  # the mean of both
+    both = skew.with_added(np.diag([0.04, 0.0]))  # as much again
+    np.testing.assert_allclose(ln(middle / intervals(theta, both)[0][0][0]), 3.0 * np.sqrt(2.0) * ln(middle / even[0]))
+
+
 def bound(body: PushedBody, zones: Zones, sd_mm: float) -> Uncertainty:
     lame, shear = body.moduli
     first = [int(np.flatnonzero(zones.of_cell == z)[0]) for z in range(zones.count)]

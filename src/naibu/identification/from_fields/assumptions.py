@@ -16,7 +16,7 @@ from naibu.identification.from_fields.forward.field_laws import FieldLaw, LawNam
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium
 from naibu.identification.from_fields.forward.load_cases import KnownRegion, Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
-from naibu.identification.from_fields.mesh_error import refitted
+from naibu.identification.from_fields.mesh_error import change_of_fit
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 OTHER_YOUNG, OTHER_POISSON = 0.1, 0.02  # changes whose effect is stated: relative, of Young's modulus; absolute, of Poisson's ratio
@@ -173,7 +173,7 @@ def _refitted(at: Linearised, quadratic: Concentrated, law: FieldLaw, lame: Floa
         for o, u in zip(model.observed, at.point.states, strict=True):
             state, _ = equilibrium(law, solvers, lame, shear, o.load_case, u, b"")
             changes.append(np.asarray(o.operator @ (state - u).ravel()))
-        return refitted(at, quadratic, changes).theta
+        return change_of_fit(at, quadratic, changes)
     except ConvergenceError:
         return None
 
@@ -190,6 +190,6 @@ def _with_border(at: Linearised, quadratic: Concentrated, law: LawName, points: 
             on = Observed.of(mesh, mesh, o.load_case)
             state, _ = equilibrium(body, solvers, lame, shear, on.load_case, u, b"")
             changes.append(on.residual(state) - o.residual(u))
-        return refitted(at, quadratic, changes).theta
+        return change_of_fit(at, quadratic, changes)
     except ConvergenceError:
         return None

@@ -65,8 +65,9 @@ from naibu.identification.from_fields.regions.border_refinement import (
 from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
 from naibu.identification.from_fields.size_correction import SizeCorrection, without_size_of_elements
 from naibu.identification.from_fields.statement import statement
-from naibu.identification.from_fields.surface_bias import bias_of_surface
-from naibu.identification.from_fields.surface_noise import SurfaceNoise
+from naibu.identification.from_fields.surface.bias import LEFT, without_bias
+from naibu.identification.from_fields.surface.noise import SurfaceNoise
+from naibu.identification.from_fields.surface.skewness import distances_of_bounds
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
 from naibu.identification.from_fields.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
 from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
@@ -365,11 +366,12 @@ class _Recipe:
         corrected: CorrectedRegions | None = None,
     ) -> FieldEstimate:
         """Return moduli that were fitted without a penalty, with the errors of measurement, discretisation and knowledge."""
-        at = model.linearised(point)
-        quadratic, freedom = at.concentrated(np.eye(2 * model.zones.count)), model.n_free - 2.0 * model.zones.count
+        freedom = model.n_free - 2.0 * model.zones.count
         variance = point.misfit / freedom if freedom > 0.0 else 1.0
+        best, score = point.theta, without_bias(model, point, Objective(bounds=self.bounds), variance)
+        at, quadratic, point = score.at, score.quadratic, score.at.point
         noise = SurfaceNoise.of(at, quadratic, variance)
-        size = self._size(at, quadratic, noise, refined, corrected)
+        size = self._size(at, quadratic, noise, point.theta - best, refined, corrected)
         theta, residuals, shift, alike = size.theta, size.residuals, size.shift, size.alike
         stretch = stretch_of(np.zeros_like(theta) if shift is None or corrected is not None else shift)
         misfit = sum(float(r @ r) for r in residuals)
@@ -377,6 +379,8 @@ class _Recipe:
         of_noise = Uncertainty.of(noise.information.matrix, factor)
         shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
+        of_noise = of_noise.with_sides(distances_of_bounds(score, of_noise, variance, factor * float(np.sqrt(shared))))
+        at = model.linearised(model.evaluate(point.theta, point.states))
         of_noise = of_noise.with_added(size.of_noise)
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders)).with_added(refined.apart)
@@ -399,9 +403,10 @@ class _Recipe:
                 covariance, coarse = corrected.doubt, not corrected.converged
             covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
             of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
-        best, (bias, left) = theta, bias_of_surface(at, quadratic, variance, noise.information)
+        bias = score.left(noise.information)
+        taken = best - point.theta + bias
         unsaid = np.repeat([0.0, 0.0 if tells_poisson(model) else AT_BOUND], len(theta) // 2)
-        total = total.with_added(left).with_added(np.diag(self._doubt_at_bounds(theta) ** 2 + unsaid**2))
+        total = total.with_added(np.outer(LEFT * taken, LEFT * taken)).with_added(np.diag(self._doubt_at_bounds(theta) ** 2 + unsaid**2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
         judged = with_limits(judged, names, by_elements, intervals(theta, total)[0], model.zones.unit)
@@ -413,7 +418,7 @@ class _Recipe:
         borders, parts = (None, None) if refined is None else (refined.borders, refined.parts)
         return FieldEstimate(
             model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,
-            judged, budget, shift, others, borders, parts, best - theta,
+            judged, budget, shift, others, borders, parts, taken,
         )  # fmt: skip
 
     def _size(
@@ -421,19 +426,20 @@ class _Recipe:
         at: Linearised,
         quadratic: Concentrated,
         noise: SurfaceNoise,
+        from_best: FloatArray,
         refined: RefinedRegions | None,
         corrected: CorrectedRegions | None,
     ) -> SizeCorrection:
-        """Return the best fit at vanishing element size, which regions whose borders run through cells may have already."""
+        """Return moduli at vanishing element size, which regions whose borders run through cells may have already, `from_best` fit on."""
         if corrected is not None:
-            none = np.zeros_like(quadratic.hessian)
-            return SizeCorrection(corrected.refined.theta, corrected.residuals, corrected.shift, True, none, ())
+            none, theta = np.zeros_like(quadratic.hessian), Objective(bounds=self.bounds).clipped(corrected.refined.theta + from_best)
+            return SizeCorrection(theta, corrected.residuals, corrected.shift, True, none, ())
         found = without_size_of_elements(at, quadratic, noise, self.law, self.elements, self.bounds, self.region_at)
         for told in found.told:
             self.record(told)
         if refined is None:
             return found
-        return replace(found, theta=Objective(bounds=self.bounds).clipped(found.theta + refined.theta - at.point.theta))
+        return replace(found, theta=Objective(bounds=self.bounds).clipped(found.theta + refined.theta - at.point.theta + from_best))
 
     def _doubt_at_bounds(self, theta: FloatArray) -> FloatArray:
         """Return standard deviations for logarithms at a bound, where derivatives say nothing of how far from it they may be."""

@@ -66,7 +66,7 @@ class FieldEstimate:
     parts : ndarray, shape (m, count), or None
         With such borders: part of every cell in each region, by which logarithms of moduli are mixed.
     surface_bias : ndarray, shape (2 count,), or None
-        What the motion of the surface, its weak prior and the noise had added to theta, and was taken off (see `bias_of_surface`).
+        What the motion of the surface, its weak prior and the noise had added to theta, and was taken off (see `surface.bias`).
     """
 
     mesh: Mesh

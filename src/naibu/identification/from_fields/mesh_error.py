@@ -184,6 +184,12 @@ def refitted(
     return Refit(step, left, tuple(u.reshape(state.shape) for u, state in zip(moved, at.point.states, strict=True)))
 
 
+def change_of_fit(at: Linearised, quadratic: Concentrated, changes: list[FloatArray]) -> FloatArray:
+    """Return by how much the best logarithms (2 count,) change with the whitened residuals (q,), also where `at` is not the best fit."""
+    back = np.linalg.lstsq(quadratic.hessian, quadratic.gradient, rcond=1e-12)[0]
+    return np.asarray(refitted(at, quadratic, changes).theta + back)
+
+
 def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> tuple[list[FloatArray], LawName] | None:
     """Return by how much the whitened residuals (q,) of every load case change on a mesh of half the element size, and under which law.
 

@@ -20,7 +20,7 @@ from naibu.identification.from_fields.mesh_error import (
     extrapolated,
     refitted,
 )
-from naibu.identification.from_fields.surface_noise import SurfaceNoise
+from naibu.identification.from_fields.surface.noise import SurfaceNoise
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +74,7 @@ def without_size_of_elements(
     told = ["elements of half the size find no equilibrium at finite strain: what they change is taken from small strain"]
     told *= changes[1] != law
     finer, covariance = refitted(at, quadratic, changes[0]), np.zeros_like(quadratic.hessian)
-    step = finer.theta
+    step = finer.theta + np.linalg.lstsq(quadratic.hessian, quadratic.gradient, rcond=1e-12)[0]  # `at` may not be the best fit
     if model.surface_sought:
         of_noise, covariance = noise.of_change(at, quadratic, changes[0], lambda moved: changes_of_motions(at, moduli_on, moved))
         step = -noise.information.step(-quadratic.hessian @ step) - of_noise

@@ -43,11 +43,14 @@ class Uncertainty:
     stretch : ndarray, shape (2 k,), or None
         Factors by which standard deviations of logarithms are larger than where the data were fitted, because errors of mu / kappa stayed
         while the size of elements was taken off it; None where nothing was.
+    sides : ndarray, shape (2, k), or None
+        How far the lower and the upper bound of ln E are away, over what its standard deviation says; None where they are as far.
     """
 
     information: FloatArray
     covariance: FloatArray
     stretch: FloatArray | None = None
+    sides: FloatArray | None = None
 
     @classmethod
     def of(cls, information: FloatArray, noise_factor: float = 1.0) -> Uncertainty:
@@ -68,7 +71,13 @@ class Uncertainty:
 
     def stretched(self, stretch: FloatArray) -> Uncertainty:
         """Return the uncertainty of logarithms whose errors are larger by factors (2 k,); the information stays that of the data."""
-        return Uncertainty(self.information, self.covariance * np.outer(stretch, stretch), stretch)
+        return replace(self, covariance=self.covariance * np.outer(stretch, stretch), stretch=stretch)
+
+    def with_sides(self, sides: FloatArray) -> Uncertainty:
+        """Return the uncertainty whose bounds of ln E lie `sides` (2, k) times as far below and above; ln mu errs by the mean of both."""
+        mean = sides.mean(axis=0)
+        factors = np.concatenate([mean, np.ones_like(mean)])
+        return replace(self, covariance=self.covariance * np.outer(factors, factors), sides=sides / mean)
 
     def standard_deviations(self) -> FloatArray:
         """Return those of ln mu, then ln(kappa / mu) (2 k,)."""
@@ -173,7 +182,7 @@ def intervals(theta: FloatArray, found: Uncertainty, level: float = 0.95) -> tup
     """
     k, quantile = len(theta) // 2, float(ndtri(0.5 + 0.5 * level))
     of_young, _ = found.of_young_and_poisson(theta)
-    half = quantile * of_young[:, None]
+    half = quantile * of_young[:, None] * (np.ones((k, 2)) if found.sides is None else found.sides.T)
     half = np.where(half > np.log(UNBOUNDED), np.inf, half)
     young = young_and_poisson(theta)[0][:, None] * np.exp(half * np.array([-1.0, 1.0]))
     sd = quantile * found.standard_deviations()[k:]

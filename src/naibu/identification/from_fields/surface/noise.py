@@ -1,6 +1,6 @@
 """What noise does to moduli through the sought motion of loaded nodes, beyond the bias of the best fit.
 
-The motion ``b = b_0 + e`` of the surface follows the noise, with errors e of covariance ``G^-1 A' A G^-1`` (see `surface_bias`). What is
+The motion ``b = b_0 + e`` of the surface follows the noise, with errors e of covariance ``G^-1 A' A G^-1`` (see `bias`). What is
 bilinear in the motion does not average out:
 
 - The derivatives of the residuals by the moduli are linear in the motion, so that the Gauss-Newton Hessian holds the squares of those of e.

@@ -1,0 +1,155 @@
+"""Bias that the sought motion of loaded nodes gives to moduli, and the moduli without it.
+
+It has two parts. The weak prior expects no strain along the surface: what it takes off the strain there, where measurements are few, the
+moduli make up for, and Poisson's ratio comes out too large. As with other penalised estimates, this part is what the estimator does to data
+that the model at the estimate explains exactly.
+
+The second is that of noise. The motion of the surface follows the noise, the more so the softer and the less compressible the body is, so
+that these moduli leave less of the noise unexplained. For noise n of unit variance the expectation of the least objective is half the trace
+of ``I - A (A' A + L)^-1 A'`` above that of exact data, where A leads from the motion of the surface to the measurements and L is the prior.
+That trace is the number of measurements less the number of components that they, rather than the prior, determine. With half of that
+number added the score has no bias, as corrected scores of measurement error models (:cite:p:`nakamura1990`).
+
+The moduli without bias are where that corrected score vanishes. A step from the best fit finds them only where it is short: with few points
+the best fit is far on the side of soft, incompressible bodies, where measurements tell less, and the step is several times too long.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
+from naibu.identification.from_fields.inversion.gauss_newton import Objective
+from naibu.identification.from_fields.mesh_error import change_of_fit
+from naibu.identification.from_fields.surface.noise import CorrectedInformation, tangent_columns
+
+# part of the bias that is reckoned with as a standard deviation after it was taken off: to first order, and from a biased motion
+LEFT = 0.5
+PROBES = 32  # vectors of random signs that estimate the trace: to a few per cent of the slope
+SHORT = 0.25  # standard deviations of a logarithm: of a step after which derivatives are as before it
+MOST_STEPS = 5
+SHORTEST = 0.2  # part of a step below which a body of finite strain that cannot follow it is left where it is
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CorrectedScore:
+    """Moduli, the quadratic there, and the score without bias.
+
+    Attributes
+    ----------
+    at : Linearised
+        Moduli and motion.
+    quadratic : Concentrated
+        Of all logarithms there.
+    value : ndarray, shape (2 count,)
+        Gradient of the objective, the motion of the surface eliminated, without what its prior and the noise add to it in the mean.
+    """
+
+    at: Linearised
+    quadratic: Concentrated
+    value: FloatArray
+
+    @classmethod
+    def of(cls, at: Linearised, quadratic: Concentrated, variance: float) -> CorrectedScore:
+        """Find it; `variance` is that of the residuals over that stated: beyond 1 it may be that of errors of the model, not of noise."""
+        explained = [-o.residual(u) for o, u in zip(at.model.observed, at.point.states, strict=True)]
+        of_prior = quadratic.hessian @ change_of_fit(at, quadratic, explained)
+        return cls(at, quadratic, of_prior + 0.5 * min(variance, 1.0) * slope_of_informed(at))
+
+    @property
+    def step(self) -> FloatArray:
+        """Change (2 count,) of the logarithms that would make it vanish, by no more than a standard deviation of each."""
+        inverse = np.linalg.pinv(self.quadratic.hessian, rcond=1e-12)
+        sd = np.sqrt(np.abs(np.diag(inverse)))
+        return np.asarray(np.clip(-inverse @ self.value, -sd, sd))
+
+    @property
+    def is_short(self) -> bool:
+        """Whether derivatives after that step are about those before it."""
+        sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(self.quadratic.hessian, rcond=1e-12))))
+        return bool((np.abs(self.step) <= SHORT * sd).all())
+
+    def left(self, information: CorrectedInformation) -> FloatArray:
+        """Return the bias (2 count,) that moduli still have, by the information without that of noise; one standard deviation at most."""
+        sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(information.matrix))))
+        return np.asarray(np.clip(information.step(self.value), -sd, sd))
+
+
+def without_bias(model: FieldModel, best: Point, objective: Objective, variance: float) -> CorrectedScore:
+    """Return where the score without bias vanishes but for a short step, from the best fit, which must be the model's last evaluation.
+
+    Parameters
+    ----------
+    model : FieldModel
+        Load cases and zones.
+    best : Point
+        The best fit.
+    objective : Objective
+        For its bounds.
+    variance : float
+        Of the residuals over that stated.
+    """
+    at = model.linearised(best)
+    quadratic = at.concentrated(np.eye(2 * model.zones.count))
+    quadratic = replace(quadratic, gradient=np.zeros_like(quadratic.gradient))  # but for rounding, and for bounds
+    score = CorrectedScore.of(at, quadratic, variance)
+    low, high = objective.bounds.box(model.zones.count)
+    if ((best.theta <= low + 1e-9) | (best.theta >= high - 1e-9)).any():
+        return score
+    for _ in range(MOST_STEPS):
+        if score.is_short:
+            break
+        here = score.at.point
+        step = objective.clipped(here.theta + score.step) - here.theta
+        motion = score.at.forward(step[:, None], [b[:, None] for b in score.quadratic.loaded(step)])
+        further = moved(model, here, step, [u[:, 0] for u in motion])
+        if further is None:
+            at = model.linearised(model.evaluate(here.theta, here.states))
+            return replace(score, at=at)
+        at = model.linearised(further)
+        score = CorrectedScore.of(at, at.concentrated(np.eye(2 * model.zones.count)), variance)
+    return score
+
+
+def motions_along(at: Linearised, quadratic: Concentrated, steps: FloatArray) -> list[FloatArray]:
+    """Return the displacement (n d, r), mm, of every load case that goes with steps (2 count, r), the motion of loaded nodes following."""
+    return at.forward(steps, [-(x @ steps) for x in quadratic.response])
+
+
+def moved(model: FieldModel, start: Point, step: FloatArray, motion: list[FloatArray]) -> Point | None:
+    """Return the point a step (2 count,) and its motion (n d,) further, less far where a body cannot follow; None if it cannot at all."""
+    part = 1.0
+    while part >= SHORTEST:
+        guesses = [u + part * du.reshape(u.shape) for u, du in zip(start.states, motion, strict=True)]
+        try:
+            return model.evaluate(start.theta + part * step, guesses)
+        except ConvergenceError:
+            part *= 0.5
+    return None
+
+
+def slope_of_informed(at: Linearised) -> FloatArray:
+    """Return the derivative (2 count,) of the number of loaded components that the measurements determine, by random signs.
+
+    That number is ``n_b - tr((A' A + L)^-1 L)``; its derivative, ``tr(G^-1 d(A' A) G^-1 L)`` with G = A' A + L, is estimated as
+    the mean of ``y' d(A' A) w`` with ``y = G^-1 z`` and ``w = G^-1 L z`` (:cite:p:`bekas2007`). What moduli change of the state
+    about which the body is linearised is left out.
+    """
+    observed, rng = at.model.observed, np.random.default_rng(0)
+    signs = [rng.choice([-1.0, 1.0], size=(len(o.unknown), PROBES)) for o in observed]
+    right = [np.hstack([z, o.prior @ z]) for o, z in zip(observed, signs, strict=True)]
+    moved = at.forward(None, at.loaded_solved(right))
+    pulled = [o.operator.T @ (o.operator @ v) for o, v in zip(observed, moved, strict=True)]
+    for o, pull in zip(observed, pulled, strict=True):
+        pull[o.loaded] = 0.0
+    answers = at.solved(pulled)
+    out = np.zeros(2 * at.model.zones.count)
+    for t, o in enumerate(observed):
+        answers[t][o.loaded] = 0.0
+        for k in range(2 * PROBES):
+            out -= tangent_columns(at, t, moved[t][:, k]).T @ answers[t][:, (k + PROBES) % (2 * PROBES)]
+    return out / PROBES
