@@ -82,7 +82,7 @@ class Considered:
     @property
     def base(self) -> BoolArray:
         """Whether a free parameter (p,) was sought, or is the size of the error of the elements."""
-        return self.sought | np.array([name == ELEMENTS for name in self.names])
+        return np.asarray(self.sought | np.array([name == ELEMENTS for name in self.names]))
 
     def step(self, kept: BoolArray) -> FloatArray:
         """Return the step (s,) to the optimum of the parameters that are `kept` (p,), poses following; 0 for others."""
