@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.interactive_bodies import InteractiveBody
 from naibu.simulation.tool_places import placed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class KeptState:
+    """A state of an interactive simulation to return to: body, state of its session, time, s, tool, and its position, mm, and rotation."""
+
+    body: InteractiveBody
+    state: Any
+    time_s: float
+    tool: str
+    centre: FloatArray
+    rotation: FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,11 +23,11 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.simulation.background_cut import BackgroundCut, cut_in_balance
-from naibu.simulation.frame import Frame
+from naibu.simulation.frame import Frame, KeptState
 from naibu.simulation.held_tool import HeldTool, outside_planes
 from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
 from naibu.simulation.lattice_cut import LatticeCut
-from naibu.simulation.tool_places import farthest_in_a_step, placed, towards, waiting_place
+from naibu.simulation.tool_places import FollowedHand, farthest_in_a_step, placed, towards, waiting_place
 
 FRAME_S = 1.0 / 60.0
 REACH = 2.0  # extents of the body around its centre in which the tool stays
@@ -36,18 +36,6 @@ TURNING = 3.0  # rad/s that the tool turns at most
 LEAST_TURN = 1e-6  # rad
 UNDO = 20  # states kept
 LEAVING_S = 3.0  # simulated time in which a tool that is put away leaves the body at the latest
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Kept:
-    """A state to return to."""
-
-    body: InteractiveBody
-    state: Any
-    time_s: float
-    tool: str
-    centre: FloatArray
-    rotation: FloatArray
 
 
 @dataclass(slots=True, eq=False)
@@ -64,12 +52,15 @@ class InteractiveSimulation:
         Simulated time of a frame, s.
     budget_s : float
         Time of the processor after which a frame leaves the step of a body of finite elements to the next one, s.
+    delay_s : float
+        Delay with which tool and grip follow the places to which they are led, s, so that their velocities do not leap; 0 follows at once.
     """
 
     body: InteractiveBody
     tools: Mapping[str, RigidIndenter]
     frame_s: float = FRAME_S
     budget_s: float = np.inf
+    delay_s: float = 0.0
     _session: AnySession = field(init=False)
     _tool: str = field(init=False, default="")
     _centre: FloatArray = field(init=False)
@@ -79,7 +70,9 @@ class InteractiveSimulation:
     _nodes: IntArray = field(init=False, default_factory=lambda: NO_NODES)
     _gripped: int = field(init=False, default=-1)
     _pull_target: FloatArray = field(init=False)
-    _kept: deque[_Kept] = field(init=False)
+    _tool_hand: FollowedHand = field(init=False, default_factory=FollowedHand)
+    _grip_hand: FollowedHand = field(init=False, default_factory=FollowedHand)
+    _kept: deque[KeptState] = field(init=False)
     _last: Frame = field(init=False)
     _topology: int = field(init=False, default=0)
     _surface: IntArray = field(init=False)
@@ -198,6 +191,7 @@ class InteractiveSimulation:
         near[node] = True
         self._nodes, self._gripped = np.intersect1d(np.flatnonzero(near), self._surface).astype(np.int64), node
         self._pull_target, self._under_way = self._session.positions([node])[0], None
+        self._grip_hand.stop()
         self.body.grip(self._session, self._nodes)
 
     def pull(self, position: ArrayLike) -> None:
@@ -337,6 +331,8 @@ class InteractiveSimulation:
             self._session.restore(before)
             self._target, self._rotation_target = self._centre, self._rotation
             self._pull_target = self._grip_position()
+            self._tool_hand.stop()
+            self._grip_hand.stop()
             again = self._frame(self._last.number + 1, self._last.time_s, self._last.force, self._last.pull, said)
             self._last = replace(again, unbalanced=self._last.unbalanced)
             return self._last
@@ -378,7 +374,9 @@ class InteractiveSimulation:
 
     def _next_motion(self, duration: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return where the tool goes in a frame, mm, how fast it turns, rad/s, and how far gripped nodes go, mm."""
-        reach, gripped, centre, spin = self.fastest_mm_s * duration, self._grip_position(), self._target, np.zeros(3)
+        reach, gripped, spin = self.fastest_mm_s * duration, self._grip_position(), np.zeros(3)
+        centre = self._tool_hand.next_place(self._centre, self._target, duration, self.delay_s)
+        pulled = self._grip_hand.next_place(gripped, self._pull_target, duration, self.delay_s)
         if self._tool:
             tool, spin = self.tools[self._tool], self._spin(duration) * (not self._held.crushed)
             if self.body.fixtures:
@@ -386,7 +384,7 @@ class InteractiveSimulation:
                 centre = outside_planes(self.body.fixtures, turned, centre)
             centre = towards(self._centre, centre, min(reach, farthest_in_a_step(tool) * self.steps))
             centre = self._centre + self._held.limited(self._centre, centre - self._centre, self._last.force)
-        return centre, spin, towards(gripped, self._pull_target, reach) - gripped
+        return centre, spin, towards(gripped, pulled, reach) - gripped
 
     def close(self) -> None:
         """Release what the session holds, and wait for a cut under way."""
@@ -424,6 +422,7 @@ class InteractiveSimulation:
         self._session.press(())
         self._session.restore(self.body.without_contact(state))
         self._tool, self._under_way, self._next, self._leaving, self._trapped = tool, None, None, 0, ""
+        self._tool_hand.stop()
         self._rotation = self._rotation_target = np.eye(3)
         if tool:
             positions = self._session.positions(self._surface)
@@ -439,7 +438,7 @@ class InteractiveSimulation:
         return np.asarray(np.clip(position, middle - reach, middle + reach))
 
     def _keep(self) -> None:
-        self._kept.append(_Kept(self.body, self._session.state(), self._last.time_s, self._tool, self._centre, self._rotation))
+        self._kept.append(KeptState(self.body, self._session.state(), self._last.time_s, self._tool, self._centre, self._rotation))
 
     def _frame(self, number: int, time_s: float, force: FloatArray, pull: FloatArray, failed: str) -> Frame:
         positions = self._session.positions()

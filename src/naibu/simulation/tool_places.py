@@ -1,8 +1,8 @@
-"""Where a tool is: a copy of it at another place, where it waits, and the next point on its way."""
+"""Where a tool is: a copy of it at another place, where it waits, and the next point on its way after a hand."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -11,6 +11,31 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 
 THROUGH = 0.5  # of the thinnest half extent of a tool
 MOST_RAISED = 40  # steps
+ARRIVED_MM = 1e-4
+
+
+@dataclass(slots=True, eq=False)
+class FollowedHand:
+    """What follows a hand that is seen now and then, with a velocity that does not leap: two first-order low-pass filters in series.
+
+    Otherwise it would rush to each place where the hand was seen, and wait there for the next: viscous bodies feel the velocity.
+    """
+
+    _between: FloatArray | None = field(init=False, default=None)  # what the first filter has come to
+
+    def next_place(self, at: FloatArray, hand: FloatArray, duration_s: float, delay_s: float) -> FloatArray:
+        """Return where it comes to from where it is (3,), mm; each filter delays by half of `delay_s`; 0 follows at once."""
+        between = at if self._between is None else self._between
+        if delay_s == 0.0 or max(np.abs(hand - at).max(), np.abs(hand - between).max()) < ARRIVED_MM:
+            self._between = None
+            return hand
+        rest = float(np.exp(-2.0 * duration_s / delay_s))
+        self._between = hand + rest * (between - hand)
+        return np.asarray(self._between + rest * (at - self._between))
+
+    def stop(self) -> None:
+        """Begin anew, at rest."""
+        self._between = None
 
 
 def placed(tool: RigidIndenter, centre: FloatArray, rotation: FloatArray | None = None) -> RigidIndenter:

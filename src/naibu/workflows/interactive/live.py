@@ -40,6 +40,7 @@ from naibu.workflows.markers.experiments import Source
 GRIP_RADIUS = 0.08  # of the extent of the body
 PAGE_BYTES = 5_000_000
 BUDGET_S = 0.014  # of the processor for a frame: a step that takes longer goes on in the next one
+DELAY_S = 0.06  # with which tool and grip follow a mouse, which browsers tell once a picture
 SWITCH_S = 2e-4  # in which the page leaves the interpreter to the physics of a haptic device
 
 
@@ -281,7 +282,7 @@ def _prepared(model: TouchableModel, hand: HapticHand | None) -> InteractiveSimu
 def _stepped(simulation: InteractiveSimulation, hand: HapticHand | None) -> Iterator[RealTimeLoop]:
     """Step a simulation in a thread of its own, and serve a device, until the context ends."""
     single = _single(simulation.body, hand)
-    simulation.budget_s = BUDGET_S
+    simulation.budget_s, simulation.delay_s = BUDGET_S, DELAY_S if hand is None else 0.0
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(1, user_api="blas"))  # threads of small matrices wait for one another where cores are busy
         if hand is not None:
