@@ -13,15 +13,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
+from naibu._numba.intrinsics.packed_tuples import packed
 from naibu._numba.intrinsics.simd import WIDTH, aligned, inverse_root, load, splat, store
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import AnyFloatArray, FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import add_momenta, add_reactions, advance, new_velocity
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import multiply, residual_norm, solve
 from naibu.mechanics.lattices.cpu.implicit._step_parts import constrain_part
+from naibu.mechanics.lattices.cpu.scratch import PackedArguments, Scratch
 from naibu.mechanics.lattices.model.coefficients import implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_constrained, require_numbers
@@ -160,17 +162,32 @@ def driven_steps(
     lengths = engine.stored_lengths(state)
     tangents = _stored_change(engine, start)
     rows, tables = _changed_coefficients(engine, changes)
-    blocks, own = engine.kernel
     reaction, reaction_change = np.zeros(path.shape), np.zeros((len(changes), *path.shape))
-    with engine.scratch() as (work, inner):
+    limits = (engine.tolerance, engine.tolerance if tolerance is None else tolerance, 20_000)
+    with engine.scratch() as scratch:
+        data, follower = _arguments(engine, (x, v, y, lengths), constrained, scratch)
         _driven_steps(
-            blocks, own, rows, tables, (x, v, y, lengths), tangents, engine.mass, (loads.node, loads.fraction, loads.body), pushed, work,
-            inner, (constrained.node, constrained.direction, constrained.weight, constrained.body), path, engine.step,
-            (engine.tolerance, engine.tolerance if tolerance is None else tolerance, 20_000), reaction, reaction_change,
+            data, follower, np.zeros_like(lengths), rows, tables, tangents, (loads.node, loads.fraction, loads.body), pushed,
+            constrained.weight, path, limits, reaction, reaction_change,
         )  # fmt: skip
     after = _read_change(engine, tangents)
     require_numbers(reaction, "the computed reaction")
     return DrivenMotion(replace(engine.read(x, v, y), length=lengths[engine.blocks.lane]), reaction, after, reaction_change)
+
+
+def _arguments(
+    engine: LatticeEngine, state: tuple[AnyFloatArray, ...], constrained: ConstrainedNodes, scratch: Scratch
+) -> tuple[PackedArguments, PackedArguments]:
+    """Return what the kernels of a step read, of the types that implicit steps have, and what those of the solver do for derivatives.
+
+    The latter have a velocity of their own, and constrained nodes that stand still.
+    """
+    (blocks, tables), (work, inner), (x, v, y, lengths) = engine.kernel, scratch, state
+    node, direction, body = (np.ascontiguousarray(a) for a in (constrained.node, constrained.direction, constrained.body))
+    now, still = ((node, direction, np.zeros(len(node)), body) for _ in range(2))
+    change, before, right = (aligned(v.shape, float) for _ in range(3))
+    data = packed((blocks, tables, engine.mass, v, work, inner, now), (x, y, lengths, before, right, np.zeros(0), engine.step))
+    return data, packed(blocks, tables, engine.mass, change, work, inner, still)
 
 
 def _stored_change(engine: LatticeEngine, change: StateChange) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -213,7 +230,7 @@ def _moved(parameters: LatticeParameters, change: ParameterChange, step: float) 
     return LatticeParameters(k, c1, c2, parameters.voigt_fraction)
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def _changed_impulse(first, second, rows, tables, changed, change, axes, x, v, y, xd, yd, right, step):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to `right` the derivative of the elements' impulses while v stands still, and move yd on by all but what the new lengths give.
 
@@ -250,7 +267,7 @@ def _changed_impulse(first, second, rows, tables, changed, change, axes, x, v, y
         store(f2, j, load(f2, j) - dz)
 
 
-@njit(cache=True, fastmath=_FAST)
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def _changed_extension(first, second, rows, gain, changed, change, lengths, x, xd, yd):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to yd what the new lengths give; `lengths` are the old ones, `gain` the table of g, `change` that of its derivative."""
     pad = len(x) // 3
@@ -265,76 +282,81 @@ def _changed_extension(first, second, rows, gain, changed, change, lengths, x, x
         store(yd, at, load(yd, at) + load(change, changed[k]) * stretched + load(gain, rows[k]) * (longer * inverse))
 
 
-@njit(cache=True)
-def _answer(loads, force, v, before, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add to `reaction` (bodies, 3) the force of bodies less the inertia of the nodes that share it."""
+@njit(cache=True, **UNCOUNTED)
+def _answer(loads, force, share, v, before, mass, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add to `reaction` (bodies, 3) a share of the force of bodies less the inertia of the nodes that share it."""
     node, fraction, body = loads
     pad = len(mass)
     for k in range(len(node)):
         for a in range(3):
             at = a * pad + node[k]
-            reaction[body[k], a] += fraction[k] * force[body[k], a] - mass[node[k]] * (v[at] - before[at]) / step
+            reaction[body[k], a] += share * (fraction[k] * force[body[k], a]) - mass[node[k]] * (v[at] - before[at]) / step
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, **UNCOUNTED)
 def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
-    blocks,
-    tables,
-    changed,
-    changes,
-    state,
-    tangents,
-    mass,
-    loads,
-    force,
-    work,
-    inner,
-    constrained,
-    velocity,
-    step,
-    solver,
-    reaction,
-    reaction_change,
+    data, follower, old_lengths, changed, changes, tangents, loads, force, weight, velocity, limits, reaction, reaction_change
 ):
-    """Take len(velocity) steps; x, v, y and their derivatives (p, ...) are changed, the reactions and their derivatives filled."""
-    x, v, y, lengths = state
+    """Take len(velocity) steps; the state and its derivatives (p, ...) are changed, the reactions and their derivatives filled.
+
+    `data` and `follower` are those of `_arguments`, `limits` the tolerances of velocities and derivatives, and the most iterations.
+    """
     xd, vd, yd = tangents
+    solver, (x, y, lengths, before, right, _, step) = data[0], data[1]
+    blocks, tables, mass, v, work, inner, now = solver
+    change, still = follower[3], follower[6]
     first, second, rows = blocks
     axes, r, _, q = work
-    node, fraction, body = loads
     own, pad = (tables[1], tables[2], tables[3], tables[5]), len(mass)
-    constrained_node, direction, weight, constrained_by = constrained
-    speed, at_rest, weightless = np.zeros(len(constrained_node)), np.zeros(len(constrained_node)), np.zeros_like(force[0])
-    now, still = (constrained_node, direction, speed, constrained_by), (constrained_node, direction, at_rest, constrained_by)
-    right, before, old_lengths = np.zeros_like(x), np.zeros_like(x), np.zeros_like(lengths)
-    data = ((blocks, tables, mass, v, work, inner, now), (x, y, lengths, before, right, right[:0], step))
+    _, direction, speed, constrained_by = now
     begin_with(inner, now)
     for n in range(len(velocity)):
-        before[:] = v
-        right[:] = 0
-        for k in range(len(node)):
-            for a in range(3):
-                right[a * pad + node[k]] += step * fraction[k] * force[n, body[k], a]
+        _begin(v, loads, force[n], pad, step, before, right)
         add_momenta(mass, v, 1.0, right)
-        for h in range(len(constrained_node)):
-            speed[h] = weight[h] * (direction[h] * velocity[n, constrained_by[h]]).sum()
-        _, lost, _ = new_velocity(data, (solver[0], solver[2]))
+        for h in range(len(speed)):
+            along = 0.0
+            for a in range(3):
+                along += direction[h, a] * velocity[n, constrained_by[h], a]
+            speed[h] = weight[h] * along
+        _, lost, _ = new_velocity(data, (limits[0], limits[2]))
         add_reactions(now, r, pad, step, reaction[n])
-        _answer(loads, force[n], v, before, mass, step, reaction[n])
+        _answer(loads, force[n], 1.0, v, before, mass, step, reaction[n])
         for p in range(len(xd)):
-            right[:] = 0
-            add_momenta(mass, vd[p], 1.0, right)
+            _copy(vd[p], change)
+            for i in range(len(right)):
+                right[i] = 0.0
+            add_momenta(mass, change, 1.0, right)
             _changed_impulse(first, second, rows, own, changed, changes[p], axes, x, v, y, xd[p], yd[p], right, step)
-            constrain_part(still, vd[p], pad, 0, len(constrained_node))
-            old = vd[p].copy()
-            multiply(blocks, tables[5], axes, mass, vd[p], q)
-            r[:] = right - q
-            goal = max(solver[1] ** 2 * residual_norm(r, inner[3], still), 1e-300)
-            solve((blocks, tables, mass, vd[p], work, inner, still), goal, solver[2])
+            constrain_part(still, change, pad, 0, len(speed))
+            _copy(change, vd[p])
+            multiply(blocks, tables[5], axes, mass, change, q)
+            for i in range(len(r)):
+                r[i] = right[i] - q[i]
+            goal = max(limits[1] ** 2 * residual_norm(r, inner[3], still), 1e-300)
+            solve(follower, goal, limits[2])
             add_reactions(still, r, pad, step, reaction_change[p, n])
-            _answer(loads, weightless, vd[p], old, mass, step, reaction_change[p, n])
-            xd[p] += step * vd[p]
-        old_lengths[:] = lengths
+            _answer(loads, force[n], 0.0, change, vd[p], mass, step, reaction_change[p, n])
+            _copy(change, vd[p])
+            for i in range(len(change)):
+                xd[p, i] += step * change[i]
+        _copy(lengths, old_lengths)
         advance(data, lost)
         for p in range(len(xd)):
             _changed_extension(first, second, rows, tables[3], changed, changes[p, 3], old_lengths, x, xd[p], yd[p])
+
+
+@njit(cache=True, **UNCOUNTED)
+def _copy(one, other):  # type: ignore[no-untyped-def]  # pragma: no cover
+    for i in range(len(one)):
+        other[i] = one[i]
+
+
+@njit(cache=True, **UNCOUNTED)
+def _begin(v, loads, force, pad, step, before, right):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Keep the velocity before a step, and set `right` to the impulses of the loads."""
+    node, fraction, body = loads
+    for i in range(len(v)):
+        before[i], right[i] = v[i], 0.0
+    for k in range(len(node)):
+        for a in range(3):
+            right[a * pad + node[k]] += step * fraction[k] * force[body[k], a]
