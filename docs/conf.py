@@ -28,6 +28,7 @@ extensions = [
     "sphinxcontrib.bibtex",
     "benchmark_plots",
     "benchmark_results",
+    "heading_levels",
     "naibu_help",
     "public_names",
 ]

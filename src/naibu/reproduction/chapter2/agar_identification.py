@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -25,6 +26,7 @@ WEIGHT_N, DURATION_S = 4.9, 6.0
 START = np.array([np.log(0.5 - 0.4), 0.0, AGAR_PUSH_MM])
 SPAN = np.array([1.5, 10.0, 4.0])  # standard deviations of the prior: ln(0.5 - nu), shift, depth
 REFERENCE_KPA = 10.0
+SYMBOLS = {"young_modulus": "E", "voigt_viscosity": "C1", "series_viscosity": "C2", "poisson_ratio": "Poisson's ratio"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +49,7 @@ def agar_section(trials: Mapping[str, tuple[FloatArray, FloatArray]], *, cell_mm
         rows.append((f"{what}, {unit}" if unit else what, *cells))
     rows.append(("Young's modulus 6 s after loading, kPa", *[v for fit in fits.values() for v in (fit.young_modulus, None)]))
     rows.append(("residual RMS of a coordinate, mm", *[v for fit in fits.values() for v in (fit.rms_mm, None)]))
-    columns = ("", *[text for name in fits for text in (f"{name}: estimate", f"{name}: 95 %")])
+    columns = ("quantity", *[text for name in fits for text in (f"{name}: estimate", f"{name}: 95 %")])
     name = next(iter(trials))
     sentences = undetermined_combinations(trials[name], fits[name], cell_mm)
     text = (
@@ -99,7 +101,8 @@ def undetermined_combinations(readings: tuple[FloatArray, FloatArray], fit: Agar
     trial = MotionLoadCase.of(
         "agar", study.mesh, supports, [0.0, DURATION_S], points, u, sd_mm=SD_MM, force={"weight": force}, force_sd_mn=50.0, step_s=1.0
     )
-    return identify_motion([trial], rheology_parameters({"body": AGAR})).undetermined
+    told = identify_motion([trial], rheology_parameters({"body": AGAR})).undetermined
+    return tuple(re.sub(r"body: (\w+)", lambda found: SYMBOLS[found[1]], sentence) for sentence in told)
 
 
 def _modelled(x: FloatArray, start: FloatArray, cell_mm: float) -> tuple[FloatArray, float]:
