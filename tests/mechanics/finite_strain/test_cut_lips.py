@@ -358,7 +358,7 @@ def pressed_between_walls(body, speed=-0.25):
 
 
 def test_ties_hold_no_step_whose_sides_have_opened_and_go_on_with_what_they_exerted():
-    mesh, normal, above, _, sides = obliquely_cut(*OBLIQUE[1])
+    _, normal, above, _, sides = obliquely_cut(*OBLIQUE[1])
     closed = -0.01 * np.outer(above, normal)
     slipped = closed + 1e-3 * np.random.default_rng(3).normal(size=closed.shape)
     ties = sides.ties.in_step(sides.lips, closed)
