@@ -47,7 +47,7 @@ def test_a_law_that_stiffens_stores_the_energy_of_its_second_term() -> None:
 
     def energy(stretch: FloatArray) -> float:
         j = float(np.prod(stretch))
-        return 1000.0 * 0.5 * 0.8 * 20.0 * (float((stretch**2).sum()) * j ** (-2.0 / 3.0) - 3.0) ** 2  # of the upper half
+        return float(1000.0 * 0.5 * 0.8 * 20.0 * (float((stretch**2).sum()) * j ** (-2.0 / 3.0) - 3.0) ** 2)  # of the upper half
 
     u = mesh.points * (stretches - 1.0)
     more = law.forces(lame, shear, u) - plain.forces(lame, shear, u)

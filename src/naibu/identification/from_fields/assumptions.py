@@ -125,11 +125,13 @@ def _stiffening(at: Linearised, quadratic: Concentrated, law: LawName) -> list[A
     lame, shear = moduli_of(model.zones, at.point.theta)
     own = model.law if law == "neo_hookean" else field_law(model.computed, "neo_hookean", averaged=model.averaged)
     zone, region = model.zones.of_cell, model.zones.region_of_cell
-    groups = [(f"{r.name!r}", region == number) for number, r in enumerate(model.zones.known)]
-    few = model.zones.count <= FEW_ZONES
-    groups += [(f"{name!r}", zone == i) for i, name in enumerate(model.zones.names)] if few else [("what is sought", zone >= 0)]
+    groups = {f"{r.name!r}": np.asarray(region == number) for number, r in enumerate(model.zones.known)}
+    if model.zones.count <= FEW_ZONES:
+        groups |= {f"{name!r}": np.asarray(zone == i) for i, name in enumerate(model.zones.names)}
+    else:
+        groups["what is sought"] = np.asarray(zone >= 0)
     out = []
-    for name, cells in groups:
+    for name, cells in groups.items():
         more = Stiffening(model.computed, averaged=model.averaged, ratio=np.where(cells, STIFFENING, 0.0))
         changed = _refitted(at, quadratic, more, lame, shear, than=own)
         if changed is not None and cells.any():
