@@ -21,7 +21,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
-from naibu.identification.from_fields.assumptions import MovedBorder, assumptions, covariance_of
+from naibu.identification.from_fields.assumptions import MovedBorder, assumptions, covariance_of, hangs_on_law
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
@@ -409,7 +409,9 @@ class _Recipe:
         total = total.with_added(np.outer(LEFT * taken, LEFT * taken)).with_added(np.diag(self._doubt_at_bounds(theta) ** 2 + unsaid**2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
-        judged = with_limits(judged, names, by_elements, intervals(theta, total)[0], model.zones.unit)
+        judged = with_limits(judged, names, by_elements, within := intervals(theta, total)[0], model.zones.unit)
+        if judged.ok and (hangs := hangs_on_law(others, theta, within)):
+            judged = replace(judged, limits="; ".join(filter(None, (hangs, judged.limits))))
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         limits = (TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1])) if coarse else ()
         limits += () if tells_poisson(model) else (FEW_POINTS,)
