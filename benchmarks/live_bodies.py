@@ -27,6 +27,7 @@ from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSes
 from naibu.meshing import box, to_tetra
 from naibu.simulation import FiniteElementBody, InteractiveSimulation
 from naibu.workflows import tools_for, touchable
+from naibu.workflows.interactive.cut_kernels import compile_for_cuts
 from naibu.workflows.interactive.live import BUDGET_S
 
 FRAME_S = 1.0 / 60.0
@@ -152,6 +153,7 @@ def offline(body: FiniteElementBody, tool: str, centre: FloatArray) -> FloatArra
 
 def cut(body: FiniteElementBody) -> None:
     """Cut the body half through while it sinks under its weight, and print the frames until the cut has opened, and some more."""
+    compile_for_cuts()
     simulation = InteractiveSimulation(replace(body, gravity=np.array([0.0, 0.0, -9810.0])), {})
     low, high = body.points.min(axis=0), body.points.max(axis=0)
     height, middle = 0.6 * low[2] + 0.4 * high[2], 0.5 * (low[1] + high[1])

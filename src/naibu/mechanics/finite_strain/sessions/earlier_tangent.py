@@ -42,6 +42,8 @@ class EarlierTangent:
         What the factors belong to; they end when it factorizes another matrix.
     displacement : ndarray, shape (n, 3)
         Of the nodes in that state, mm.
+    seconds : float
+        Of a processor that it took to make.
     """
 
     factors: UpdatedFactors
@@ -52,6 +54,7 @@ class EarlierTangent:
     lips: FloatArray
     solver: LinearSolver
     displacement: FloatArray
+    seconds: float = 0.0
 
 
 @dataclass(slots=True, eq=False)

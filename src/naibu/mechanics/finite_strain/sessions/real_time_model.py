@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -87,6 +88,7 @@ def tangent_at(
     begun : LipMultipliers, optional
         What the sides of cuts exerted when the step began; nothing by default.
     """
+    began = time.thread_time()
     assembler = with_secant(with_multipliers(engine.assembler, begun), slipped)
     pattern, blocks = assembler.pattern, assembler.evaluate(u)[2]
     contact = np.zeros((engine._surface.n_blocks, 3, 3))
@@ -101,4 +103,5 @@ def tangent_at(
     factors.prepare(ahead)
     touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
     lips = np.concatenate([np.zeros((0, 3, 3)), *(some.add(u, np.zeros_like(u), secant=True)[1] for some in lips_of(assembler))])
-    return EarlierTangent(factors, engine._elements.dilatation(u)[1], contact, held, touched, lips, solver, u)
+    dilatation = engine._elements.dilatation(u)[1]
+    return EarlierTangent(factors, dilatation, contact, held, touched, lips, solver, u, time.thread_time() - began)

@@ -102,6 +102,7 @@ class RealTimeSession(NewtonSession):
     _trial: Trial | None = field(init=False, default=None)
     _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
     _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
+    _patience: float = field(init=False, default=np.inf)  # processor time at which a step gives an earlier tangent up
     _search: Generator[None, None, Trial | FloatArray | None] | None = field(init=False, default=None)  # of the step under way
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
@@ -219,10 +220,13 @@ class RealTimeSession(NewtonSession):
         pressure = self._pressure
         if pressure is None:
             pressure = self._engine._elements.bulk * self._engine._elements.dilatation(start.displacement)[0]
-        before, deadline = self.iterations, (time.thread_time() + BUDGET_S if self._engine.background else np.inf)
+        before, now = self.iterations, time.thread_time()
+        deadline = now + BUDGET_S if self._engine.background else np.inf
+        # iterations that have taken as long as a tangent of the step's own would, and found nothing, are given up for it
+        self._patience = now + max(BUDGET_S, tangent.seconds) if self._engine.background else np.inf
         best = yield from self._from_guesses(tangent, moving, inertial, pressure, deadline)
         if best is None or best.error > ACCEPTED:
-            self.waits += 1
+            self.waits, self._patience = self.waits + 1, np.inf
             best = yield from self._from_guesses((yield from self._renewed()), moving, inertial, pressure, np.inf)
         if best is None or best.error > ACCEPTED:
             return None
@@ -238,7 +242,7 @@ class RealTimeSession(NewtonSession):
         best = None
         for first, near, most in self._guesses(tangent, moving, inertial, pressure):
             best = (yield from self._iterated(near, first, inertial, deadline, most)).better(best)
-            if best.error <= ACCEPTED:
+            if best.error <= ACCEPTED or time.thread_time() > self._patience:
                 break
         return best
 
@@ -302,6 +306,8 @@ class RealTimeSession(NewtonSession):
             stalls = rubs and k > 1 and trial.error > NEARER * before and trial.felt <= STALLED
             if k and trial.passable(bulk) and (stalls or (k >= USUAL and trial.felt <= FELT) or time.thread_time() > deadline):
                 return trial
+            if time.thread_time() > self._patience and best.error > ACCEPTED:
+                break
             yield
             after = yield from self._improved(tangent, trial, inertial, mixing)
             if after is None or after.error > DIVERGED:
