@@ -4,8 +4,8 @@ A cube of 20 mm is cut right through without friction by planes of some slope, a
 hold its ends while the other faces cannot move across themselves (held), or by a patch of 10 mm on its top (patch). Printed are the force
 in per cent of that of the same mesh before the cut, and the side force over the normal one, which between plates is the plane's slope.
 Where the block is held, stress along the cut is as large as that across it, and with the normals of the blade, ties hold together the
-steps in which facets follow the plane. Last is the least force that `softer_behind_cuts` lets a held block have in time steps, where there
-are no such ties; pages of cut bodies say that. A dash stands where no balance was found.
+steps in which facets follow the plane. Last is the least force that `softer_behind_cuts` lets a held block have in time steps while it
+rises, where these ties take some steps to carry what they ought to; pages of cut bodies say that. A dash stands where no balance was found.
 
 Usage: python benchmarks/cut_contact.py
 """

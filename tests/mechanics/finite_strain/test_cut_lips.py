@@ -256,37 +256,26 @@ def test_a_live_body_cut_and_pressed_carries_the_pressure():
 @pytest.mark.parametrize(("height", "tilt", "n"), [(0.6, 0.0, 5), (0.45, 4.0, 5)])
 @pytest.mark.parametrize("ratio", [0.3, 0.45, 0.49])
 def test_how_much_too_soft_a_body_between_walls_is_behind_a_cut_is_said(height, tilt, n, ratio):
-    """Between walls a nearly incompressible cut block is as stiff as the whole one; what is missing is within what is said, and not far.
-
-    That is with the steps of live bodies, which yield, in a static solution; otherwise those of static solutions are tied.
-    """
-    law, blade = material("neo_hookean", young_modulus=10.0, poisson_ratio=ratio), plane_blade(height * SIZE, tilt)
-    whole = box((SIZE,) * 3, (n, n, n), cell_type="tetra", centred=False)
-    plain = Assembler.from_materials(elements(whole, "mean_dilatation"), whole.regions, [law])
-    body, _, found = FiniteElementBody.of(whole, plain).cut(FiniteElementBody.of(whole, plain).engine.rest(), blade, SIZE / n)
-    places, number = np.unique(found.mesh.points, axis=0, return_inverse=True)
-    joined = Mesh.from_arrays(places, number.ravel()[found.mesh.cells], "tetra")
-    forces = []
-    for mesh, assembler in (
-        (joined, Assembler.from_materials(elements(joined, "mean_dilatation"), joined.regions, [law])),
-        (found.mesh, replace(body.engine.assembler, ties=None)),
-    ):
-        top = mesh.points[:, 2] > SIZE - 1e-9
-        walls = (mesh.points < 1e-9) | (mesh.points > SIZE - 1e-9) | top[:, None]
-        held = PrescribedDisplacement(walls, np.where(top[:, None], [0.0, 0.0, -0.2], 0.0))
-        task = Problem(mesh.points, assembler, (), held, np.zeros_like(mesh.points))
-        u = solve(task, settings=SolverSettings(tolerance=1e-8)).displacement
-        forces.append(assembler.forces(u)[1][top, 2].sum())
-    softer, said = 100.0 * (1.0 - forces[1] / forces[0]), softer_behind_cuts(body.engine.assembler)
+    """Between walls a cut block resists as the whole one; what it lacks while a pressure rises fast is within what is said, and not far."""
+    law = material("neo_hookean", young_modulus=10.0, poisson_ratio=ratio)
+    mesh = box((SIZE,) * 3, (n, n, n), cell_type="tetra", centred=False)
+    plain = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
+    uncut = FiniteElementBody.of(mesh, plain, step_s=0.02)
+    body, _, _ = uncut.cut(uncut.engine.rest(), plane_blade(height * SIZE, tilt), SIZE / n)
+    joined = cut_block(height * SIZE, tilt, n=n)[0]
+    whole = FiniteElementBody.of(joined, Assembler.from_materials(elements(joined, "mean_dilatation"), joined.regions, [law]), step_s=0.02)
+    forces = [pressed_between_walls(some, speed=-0.8, steps=3) for some in (whole, body)]
+    lacking = 100.0 * (1.0 - np.array(forces[1]) / forces[0])
+    softer, said = lacking[1:].max(), softer_behind_cuts(body.engine.assembler)
     tool = plane_indenter((0.0, 0.0, 2.0 * SIZE), (0.0, 0.0, -1.0))
     if tilt == 0.0:
-        assert softer < 2.0 and said < 1.0  # of the penalty of static solutions; it is made up in time steps
+        assert lacking[-1] < 2.0 and said < 1.0
     elif ratio > 0.4:  # else stresses along the cut and across it differ, and sides that slide relieve shear as they ought to
         assert 0.5 * said < softer < said
     assert ("too low where walls keep" in body.caution("the plate", tool)) == (said >= 5.0)
     assert body.caution("the pull", None) == body.caution("the plate", tool).replace("the plate", "the pull")
     assert (said >= 5.0) == (ratio == 0.49 and tilt > 0.0)
-    assert softer_behind_cuts(plain) == 0.0 and FiniteElementBody.of(whole, plain).caution("the plate", tool) == ""
+    assert softer_behind_cuts(plain) == 0.0 and uncut.caution("the plate", tool) == ""
 
 
 def confined(mesh, ratio, top_mm):
@@ -324,7 +313,7 @@ LEVEL = (0.5, 0.0, 4)
     ("cut", "ratio", "within"),
     [
         (LEVEL, 0.3, 0.02), (LEVEL, 0.49, 0.01), (LEVEL, 0.499, 0.01),
-        (OBLIQUE[1], 0.49, 0.02), (OBLIQUE[1], 0.499, 0.04), (OBLIQUE[2], 0.499, 0.02),
+        (OBLIQUE[0], 0.49, 0.03), (OBLIQUE[0], 0.499, 0.09), (OBLIQUE[1], 0.49, 0.02), (OBLIQUE[1], 0.499, 0.04), (OBLIQUE[2], 0.499, 0.02),
     ],
 )  # fmt: skip
 def test_between_walls_a_cut_block_resists_in_time_steps_as_the_whole_one_does(cut, ratio, within):
@@ -342,8 +331,8 @@ def test_between_walls_a_cut_block_resists_in_time_steps_as_the_whole_one_does(c
     assert forces[0] < -10.0 and forces[1] == pytest.approx(forces[0], rel=within)
 
 
-def pressed_between_walls(body, speed=-0.25):
-    """Forces on a plate that presses a block between walls for ten steps and rests for twenty, mN."""
+def pressed_between_walls(body, speed=-0.25, steps=10):
+    """Forces on a plate that presses a block between walls for some steps and rests for twenty, mN."""
     walls = [
         plane_indenter(np.where(np.arange(3) == axis, high * SIZE, 0.5 * SIZE), np.where(np.arange(3) == axis, 1.0 - 2.0 * high, 0.0))
         for axis in range(3)
@@ -353,7 +342,8 @@ def pressed_between_walls(body, speed=-0.25):
     with replace(body, engine=replace(body.engine, background=False)).session() as session:
         session.press(walls)
         return [
-            session.step(motions=[*still, IndenterVelocity((0.0, 0.0, speed if k < 10 else 0.0))]).indenters[0, 5, 2] for k in range(30)
+            session.step(motions=[*still, IndenterVelocity((0.0, 0.0, speed if k < steps else 0.0))]).indenters[0, 5, 2]
+            for k in range(steps + 20)
         ]
 
 
