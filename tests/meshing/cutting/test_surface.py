@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from itertools import pairwise
 
 import numpy as np
@@ -214,6 +215,18 @@ def test_the_walls_of_a_groove_reach_from_both_lips_to_the_tips_of_the_tool():
     assert (ends[len(cut.points) :] > 0).all()
     inside = groove(cut_surface(points, triangles, [[20, 50.2, -3.0], [70, 50.2, -3.0]], D))
     assert inside.triangles.min() >= 0 and inside.area_mm2 == pytest.approx(2 * depth * 50.0, rel=0.25)
+
+
+def test_a_copy_in_the_middle_of_a_cut_goes_on_as_the_cut_itself_would_and_leaves_it_alone():
+    points, triangles = plate()
+    cutter = SurfaceCutter(points, triangles, D)
+    cutter.move([10.0, 50.0, 0.0])
+    cutter.move([30.0, 50.0, 0.0])
+    before, copy = cutter.n_steps, deepcopy(cutter)
+    copy.move([60.0, 60.0, 0.0])
+    assert copy.n_steps > before == cutter.n_steps
+    cutter.move([60.0, 60.0, 0.0])
+    np.testing.assert_array_equal(cutter.result().points, copy.result().points)
 
 
 def test_the_tool_cuts_while_it_moves_and_two_contacts_are_two_cuts():

@@ -167,7 +167,7 @@ class _NamedItem(AttributeTemplate):
 
     key = PackedTuple
 
-    def generic_resolve(self, kind: PackedTuple, name: str) -> Any:
+    def generic_resolve(self, kind: PackedTuple, name: str) -> Any:  # type: ignore[override]
         """Return the type of an item; None where none has this name."""
         return kind.types[kind.fields.index(name)] if name in kind.fields else None
 

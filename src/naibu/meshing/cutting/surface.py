@@ -132,6 +132,15 @@ class SurfaceCutter:
         self._tool = ToolArrays(*[*path, edges, *k[8:]])
         self._pack()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what the kernels get, which holds addresses: those of a copy are others."""
+        return {name: value for name, value in self.__dict__.items() if name != "_packed"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Hand over the arrays of the copy."""
+        self.__dict__.update(state)
+        self._pack()
+
     def _pack(self) -> None:
         """Hand over other arrays to the kernels from now on."""
         self._packed = packed_items(self.arrays), packed_items(self._tool), packed_items(self._grid)
