@@ -94,7 +94,8 @@ class EpipolarCurve:
 
     def in_band(self, places: ArrayLike) -> BoolArray:
         """Return which places (..., 2) lie in the band."""
-        return np.any([inside_polygon(strip, places) for strip in self.strips], axis=0)
+        inside: BoolArray = np.any([inside_polygon(strip, places) for strip in self.strips], axis=0)
+        return inside
 
     def distance(self, place: ArrayLike) -> float:
         """Return the distance of a place (2,) from the curve, mm."""
