@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+from browser import CHROMIUM, opened_browser
 from matplotlib.figure import Figure as Canvas
 
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
@@ -31,3 +33,15 @@ def test_page_and_numbers(tmp_path: Path) -> None:
     assert "http://" not in html and "https://" not in html
     assert data["tables"][0]["rows"] == [["x & y", 1.0, 1.23456], ["z", None, None]] and data["settings"] == {"seed": 3}
     assert write_chapter(Chapter("ch9", "Chapter 9", sections, {"seed": 3}), tmp_path)[0].read_text(encoding="utf-8") == html
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_a_long_word_does_not_make_the_page_wider_than_a_phone(tmp_path: Path) -> None:
+    """A paragraph named a function by its full path, and all of the page could be shifted sideways."""
+    text = "See naibu.identification.material_testing.compression_test.young_modulus_of_cylinders."
+    page, _ = write_chapter(Chapter("ch9", "Chapter 9", (Section("Part", (text,)),), {}), tmp_path)
+    with opened_browser(390, 844) as browser:
+        browser.resize(390, 844)
+        browser.open(page.as_uri())
+        browser.wait("document.readyState === 'complete' && document.querySelector('p') !== null")
+        assert browser.value("document.documentElement.scrollWidth") <= 390
