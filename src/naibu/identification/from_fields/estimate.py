@@ -54,6 +54,7 @@ from naibu.identification.from_fields.mesh_error import (
     one_cell_thick,
     relative_change,
     stretch_of,
+    told_of_elements,
 )
 from naibu.identification.from_fields.regions.border_refinement import (
     MOST_REGIONS,
@@ -76,8 +77,6 @@ from naibu.identification.load_case import require_load_cases
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
 NO_REGIONS = "No few regions of one material each explain the measurement: the result is a map under a penalty, without intervals."
-TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones."
-ONE_CELL_THICK = "One element thick in a large part: {}. Moduli may be wrong by a third, theirs several times: see intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
 AT_BOUND = 3.7  # standard deviation of ln(kappa / mu) where it is at its bound: half of the way down to that of a Poisson's ratio of 0
@@ -379,9 +378,10 @@ class _Recipe:
         of_noise = Uncertainty.of(noise.information.matrix, factor)
         shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
-        of_noise = of_noise.with_sides(distances_of_bounds(score, of_noise, variance, factor * float(np.sqrt(shared))))
+        of_noise = of_noise.with_sides(distances_of_bounds(score, of_noise, variance, factor * float(np.sqrt(shared)))).with_added(
+            size.of_noise
+        )
         at = model.linearised(model.evaluate(point.theta, point.states))
-        of_noise = of_noise.with_added(size.of_noise)
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders)).with_added(refined.apart)
         on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
@@ -409,18 +409,15 @@ class _Recipe:
         total = total.with_added(np.outer(LEFT * taken, LEFT * taken)).with_added(np.diag(self._doubt_at_bounds(theta) ** 2 + unsaid**2))
         theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
-        judged = with_limits(judged, names, by_elements, within := intervals(theta, total)[0], model.zones.unit)
-        if judged.ok and (hangs := hangs_on_law(others, theta, within)):
-            judged = replace(judged, limits="; ".join(filter(None, (hangs, judged.limits))))
+        bounds = intervals(theta, total)[0]
+        judged = with_limits(judged, names, by_elements, bounds, model.zones.unit, of_law=hangs_on_law(others, theta, bounds))
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
-        limits = (TOO_COARSE, *(ONE_CELL_THICK.format(", ".join(thin)) for _ in thin[:1])) if coarse else ()
-        limits += () if tells_poisson(model) else (FEW_POINTS,)
+        limits = (*told_of_elements(coarse, thin), *(FEW_POINTS,) * (not tells_poisson(model)))
         words = statement(judged, model.zones, theta, total, others, limits=limits, budget=budget)
-        states = tuple(u[: model.mesh.n_points] for u in point.states)
         borders, parts = (None, None) if refined is None else (refined.borders, refined.parts)
         return FieldEstimate(
-            model.mesh, model.zones, theta, states, misfit, freedom, total, None, None, None, None, status, tuple(self.steps), words,
-            judged, budget, shift, others, borders, parts, taken,
+            model.mesh, model.zones, theta, tuple(u[: model.mesh.n_points] for u in point.states), misfit, freedom, total, None, None, None,
+            None, status, tuple(self.steps), words, judged, budget, shift, others, borders, parts, taken,
         )  # fmt: skip
 
     def _size(

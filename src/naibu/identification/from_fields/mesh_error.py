@@ -9,7 +9,7 @@ about 1.8. What extrapolation adds is doubted accordingly.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -36,6 +36,8 @@ THIN = 0.5  # as large a change is reckoned with where a zone is one cell thick,
 ITSELF = 3.0  # times as much for the moduli of that zone: skins of virtual legs came out several times too soft
 ONE_CELL = 0.25  # part of the cells of a zone that lie between others on opposite sides, from which it is called one cell thick
 MOST_UNKNOWNS = 600_000  # of the finer mesh
+TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones."
+ONE_CELL_THICK = "One element thick in a large part: {}. Moduli may be wrong by a third, theirs several times: see intervals."
 ModuliOn = Callable[[Mesh, Zones], tuple[FloatArray, FloatArray]]  # lambda and mu, kPa, of the cells of a mesh
 
 
@@ -103,6 +105,11 @@ def one_cell_thick(mesh: Mesh) -> tuple[str, ...]:
     k = len(mesh.region_names)
     share = np.bincount(mesh.regions, alone, k) / np.maximum(np.bincount(mesh.regions, minlength=k), 1)
     return tuple(name for name, part in zip(mesh.region_names, share, strict=True) if part > ONE_CELL)
+
+
+def told_of_elements(coarse: bool, thin: Sequence[str]) -> tuple[str, ...]:
+    """Say that elements are too coarse, where they are, and which zones are one element thick."""
+    return (TOO_COARSE, *[ONE_CELL_THICK.format(", ".join(thin))] * bool(thin)) if coarse else ()
 
 
 def doubt_of(

@@ -117,7 +117,9 @@ def _without(judged: Verdict, names: Sequence[str], refused: BoolArray, half: Ha
     return replace(judged, explanation=part, limits=limits, mesh_dependent=tuple(names[i] for i in lost))
 
 
-def with_limits(judged: Verdict, names: Sequence[str], of_mesh: FloatArray | None, bounds: FloatArray, unit: str = " kPa") -> Verdict:
+def with_limits(
+    judged: Verdict, names: Sequence[str], of_mesh: FloatArray | None, bounds: FloatArray, unit: str = " kPa", *, of_law: str = ""
+) -> Verdict:
     """Return the verdict with the zones first whose modulus is known only roughly, or not at all, and why.
 
     Residuals as small as the noise tell neither errors of elements nor what the measurement leaves open, so that nobody should read of an
@@ -135,6 +137,8 @@ def with_limits(judged: Verdict, names: Sequence[str], of_mesh: FloatArray | Non
         95 % intervals of Young's modulus, kPa.
     unit : str
         That of moduli, none of multiples.
+    of_law : str
+        What hangs on the law that was assumed, in words; told first.
     """
     if not judged.ok:
         return judged
@@ -144,7 +148,7 @@ def with_limits(judged: Verdict, names: Sequence[str], of_mesh: FloatArray | Non
     lost = told & ~(factors <= UNDETERMINED)
     by_elements = told & ~lost & (of_mesh is not None and of_mesh > ROUGHLY)
     by_data = told & ~lost & ~by_elements & (factors > np.exp(1.96 * ROUGHLY))
-    limits = [judged.limits] if judged.limits else []
+    limits = [text for text in (of_law, judged.limits) if text]
     if lost.any():
         each = [f"{names[i]} ({_between(float(bounds[i, 0]), float(bounds[i, 1]), unit)})" for i in np.flatnonzero(lost).tolist()]
         limits.append(f"Young's modulus of {' and '.join(each)} is not determined")

@@ -19,13 +19,13 @@ from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.assumptions import holds
-from naibu.identification.from_fields.estimate import TOO_COARSE
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
+from naibu.identification.from_fields.mesh_error import TOO_COARSE
 from naibu.identification.from_fields.regions.relative_map import identify_relative_map
 from naibu.identification.from_fields.uncertainty import MESH_DEPENDENT, NOT_DETERMINED, NOT_USABLE, POISSON_POORLY, Uncertainty, grade
 from naibu.identification.verdict import Explanation

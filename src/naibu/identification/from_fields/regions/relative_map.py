@@ -16,7 +16,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress
 from naibu.identification.from_fields.assumptions import Assumption
-from naibu.identification.from_fields.estimate import TOO_COARSE, identify_field
+from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import (
@@ -31,6 +31,7 @@ from naibu.identification.from_fields.forward.load_cases import (
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.inversion.regularization import cell_volumes, inner_faces
+from naibu.identification.from_fields.mesh_error import TOO_COARSE
 from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.uncertainty import Uncertainty, intervals, young_and_poisson_slopes
 from naibu.identification.from_fields.verdict import FEW_POINTS, told_points
