@@ -35,6 +35,7 @@ from naibu.identification.from_fields.forward.sensitivities import (
 )
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.inversion.gauss_newton import (
+    AT_BOUND,
     Bounds,
     Found,
     Objective,
@@ -79,7 +80,6 @@ START_POISSON_RATIO = 0.4
 NO_REGIONS = "No few regions of one material each explain the measurement: the result is a map under a penalty, without intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
-AT_BOUND = 3.7  # standard deviation of ln(kappa / mu) where it is at its bound: half of the way down to that of a Poisson's ratio of 0
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
 
 
@@ -291,35 +291,41 @@ class _Recipe:
         """Return the regions as the result if they explain the measurements, else the field under the penalty."""
         target = self.model.n_free
         limit = max(field.chi_squared, target) + UNEXPLAINED * float(np.sqrt(2.0 * target))
-        misfit, count = regions.point.misfit, regions.zones.count
         self.record(
-            f"{regions.clusters} clusters made {count} regions ({regions.moved} zones changed sides): misfit {misfit:.4g} without penalty"
+            f"{regions.clusters} clusters made {regions.zones.count} regions ({regions.moved} zones changed sides): "
+            f"misfit {regions.point.misfit:.4g} without penalty"
         )
-        if misfit > limit:
+        sharp = self._with_borders(regions, graph, limit)
+        if sharp is None:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
             words = (NO_REGIONS, *field.identifiability)
             return replace(field, segmentation=regions, steps=tuple(self.steps), identifiability=words)
-        sharp = self._with_borders(regions, graph)
         return replace(
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
             identifiability=(*sharp.identifiability, *field.identifiability),
         )  # fmt: skip
 
-    def _with_borders(self, regions: Segmentation, graph: ZoneGraph) -> FieldEstimate:
-        """Return the fit of regions whose borders run through cells, where there are few regions in a map of single cells."""
+    def _with_borders(self, regions: Segmentation, graph: ZoneGraph, limit: float) -> FieldEstimate | None:
+        """Return the fit of regions, where there are few of single cells with borders through these; None if its misfit exceeds a limit."""
+
+        def of_cells() -> FieldEstimate | None:
+            return self._sharp(regions.zones, regions.point, None) if regions.point.misfit <= limit else None
+
         single = graph.count == int((self.model.zones.of_cell != KNOWN).sum()) and self.model.mesh.dimension == 3
         if not single or not 1 < regions.zones.count <= MOST_REGIONS:
-            return self._sharp(regions.zones, regions.point, None)
+            return of_cells()
         try:
             refined = refined_regions(self.model, regions, graph, self.bounds)
         except ConvergenceError:
             self.record("no equilibrium was found with borders within cells: those on faces of cells are kept")
-            return self._sharp(regions.zones, regions.point, None)
+            return of_cells()
         charge = float(np.log(self.model.n_free) + np.log(graph.count)) * (regions.zones.count - refined.zones.count)
         if not 0.5 * refined.point.misfit < 0.5 * regions.point.misfit + charge:
             self.record("borders within cells explain no more than those on faces of cells, which are kept")
-            return self._sharp(regions.zones, regions.point, None)
+            return of_cells()
         self.record(f"borders of {refined.zones.count} regions within cells: misfit {refined.point.misfit:.4g}")
+        if refined.point.misfit > limit:
+            return None
         corrected = self._corrected(refined)
         refined = refined if corrected is None else corrected.refined
         model = self.model.with_zones(refined.zones)
@@ -403,8 +409,8 @@ class _Recipe:
             of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
         taken = best - point.theta + (bias := score.left(noise.information))
         unsaid = np.repeat([0.0, 0.0 if tells_poisson(model) else AT_BOUND], len(theta) // 2)
-        total = total.with_added(np.outer(LEFT * taken, LEFT * taken)).with_added(np.diag(self._doubt_at_bounds(theta) ** 2 + unsaid**2))
-        theta = np.where(self._doubt_at_bounds(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
+        total = total.with_added(np.outer(LEFT * taken, LEFT * taken)).with_added(np.diag(self.bounds.doubt_at(theta) ** 2 + unsaid**2))
+        theta = np.where(self.bounds.doubt_at(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
         bounds = intervals(theta, total)[0]
         judged = with_limits(judged, names, by_elements, bounds, model.zones.unit, of_law=hangs_on_law(others, theta, bounds))
@@ -436,11 +442,3 @@ class _Recipe:
         if refined is None:
             return found
         return replace(found, theta=Objective(bounds=self.bounds).clipped(found.theta + refined.theta - at.point.theta + from_best))
-
-    def _doubt_at_bounds(self, theta: FloatArray) -> FloatArray:
-        """Return standard deviations for logarithms at a bound, where derivatives say nothing of how far from it they may be."""
-        k, (low, high) = len(theta) // 2, self.bounds.box(len(theta) // 2)
-        doubt = np.where(theta >= high - 1e-9, AT_BOUND, 0.0)
-        of_shear = np.flatnonzero((theta[:k] <= low[:k] + 1e-9) | (theta[:k] >= high[:k] - 1e-9))
-        doubt[of_shear] = high[of_shear] - low[of_shear]
-        return doubt

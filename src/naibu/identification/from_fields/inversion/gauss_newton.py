@@ -25,6 +25,7 @@ from naibu.identification.from_fields.inversion.regularization import Regulariza
 LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
 SHORTEST_FRACTION = 1e-3  # of a step, below which the search ends
 NEGLIGIBLE = 1e-9  # by how much a step must promise to lower half of chi squared to be worth taking
+AT_BOUND = 3.7  # standard deviation of ln(kappa / mu) where it is at its bound: half of the way down to that of a Poisson's ratio of 0
 ANCHOR = 1e-9  # of the Hessian's largest diagonal entry, on every modulus: what neither data nor penalty determine stays where it is
 SEARCHING = "searching moduli, iteration"
 
@@ -65,6 +66,14 @@ class Bounds:
         ratio = np.log(2.0 * (1.0 + nu) / (3.0 * (1.0 - 2.0 * nu)))
         both = np.stack([np.repeat([shear[k], ratio[k]], count) for k in range(2)])
         return both[0], both[1]
+
+    def doubt_at(self, theta: FloatArray) -> FloatArray:
+        """Return standard deviations (2 count,) of logarithms at a bound, where derivatives say nothing of how far from it they may be."""
+        k, (low, high) = len(theta) // 2, self.box(len(theta) // 2)
+        doubt = np.where(theta >= high - 1e-9, AT_BOUND, 0.0)
+        of_shear = np.flatnonzero((theta[:k] <= low[:k] + 1e-9) | (theta[:k] >= high[:k] - 1e-9))
+        doubt[of_shear] = high[of_shear] - low[of_shear]
+        return doubt
 
 
 @dataclass(frozen=True, slots=True, eq=False)
