@@ -420,7 +420,7 @@ def test_good_data_are_explained(press: Press) -> None:
     assert next(iter(summary)) == "verdict"
     assert summary["verdict"]["explanation"] == "explained" and summary["verdict"]["sentence"] == verdict.sentence
     page = (press.results / "report.html").read_text(encoding="utf-8")
-    assert page.index(verdict.sentence) < page.index("One set of parameters fits the markers of one loaded state")
+    assert page.index(escape(verdict.sentence)) < page.index("One set of parameters fits the markers of one loaded state")
     assert press.identification.model.reservation == ""
 
 

@@ -236,7 +236,7 @@ def undetermined(model: CalibratedModel, names: Sequence[str], priors: Parameter
 
 def _undetermined(p: Parameter, model: CalibratedModel, assumed: Parameter | None) -> str:
     """What the data leave open about one parameter; empty where they determine it."""
-    sd, (low, high) = model.standard_deviation(p.name), model.interval(p.name)
+    sd, (low, high) = model.standard_deviation(p.name, law_exact=True), model.interval(p.name)
     if p.scale == "incompressibility" and high > INCOMPRESSIBLE:
         if low > NOT_VERY_COMPRESSIBLE:
             return f"at least {low:.3f}; the data do not distinguish it from incompressible."
