@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from naibu.mechanics.finite_strain.lip_assembly import LipAssembler
+from naibu.mechanics.finite_strain.lip_assembly import LipAssembler, with_multipliers
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeEngine
 from naibu.simulation import FiniteElementBody, InteractiveSimulation
 from naibu.workflows import touchable
@@ -35,7 +35,9 @@ def test_gels_that_are_cut_right_through_under_their_weight_go_on_with_friction(
     now = simulation.body
     assert isinstance(now, FiniteElementBody) and isinstance(now.engine.assembler, LipAssembler)
     state = simulation._session.state()
-    stepped = now.engine.assembler.in_step(state.displacement, state.lips)
+    stepped = with_multipliers(now.engine.assembler, state.multipliers)
+    assert isinstance(stepped, LipAssembler)
+    stepped = stepped.in_step(state.displacement, state.lips)
     assert stepped.lips is not None
     across, traction = stepped.lips.slip_forces(state.displacement)
     above = now.engine.points[:, 2] > middle + 2.0
