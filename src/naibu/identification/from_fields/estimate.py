@@ -385,9 +385,8 @@ class _Recipe:
         of_noise = Uncertainty.of(noise.information.matrix, factor)
         shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
         of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
-        of_noise = of_noise.with_sides(distances_of_bounds(score, of_noise, variance, factor * float(np.sqrt(shared))))
+        of_noise = of_noise.with_sides(distances_of_bounds(score, of_noise, variance, factor * shared**0.5)).with_added(size.of_noise)
         at = model.linearised(model.evaluate(point.theta, point.states))
-        of_noise = of_noise.with_added(size.of_noise)
         if refined is not None:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders)).with_added(refined.apart)
         on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
@@ -409,8 +408,7 @@ class _Recipe:
                 covariance, coarse = corrected.doubt, not corrected.converged
             covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
             of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
-        bias = score.left(noise.information)
-        taken = best - point.theta + bias
+        taken = best - point.theta + (bias := score.left(noise.information))
         unsaid = np.repeat([0.0, 0.0 if tells_poisson(model) else AT_BOUND], len(theta) // 2)
         total = total.with_added(np.outer(LEFT * taken, LEFT * taken)).with_added(np.diag(self.bounds.doubt_at(theta) ** 2 + unsaid**2))
         theta = np.where(self.bounds.doubt_at(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
