@@ -103,6 +103,7 @@ def test_a_gel_of_another_law_stays_within_the_intervals(gel: Experiment, found:
     )
     np.testing.assert_allclose(with_law.points, without.points, atol=1e-6)
     assert covered(with_law) > 0.9
+    assert np.sqrt(np.mean(with_law.sd_mm**2)) < 3.0 * np.sqrt(np.nanmean(with_law.residual**2))  # and is of use
     assert covered(without) < covered(with_law) - 0.1
     assert with_law.strain_ratio == pytest.approx(np.log(26.0 / 40.0) / np.log(33.0 / 40.0), rel=0.15)
     assert any("extrapolation: the state is strained 2" in note for note in with_law.notes)

@@ -31,6 +31,9 @@ from naibu.identification.from_markers.specimen.parameter_names import (
 )
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
 
+# Parameters of laws that predictions count with. The cubic term grows with the fourth power of the strain; where that of a predicted state
+# is beyond what was calibrated, displacements to first order in it exaggerate many times: what stiffens is strained less.
+PREDICTED_SHAPES = ("c01_fraction", "c20_ratio")
 # standard deviations of what is taken for known, on the optimiser's scale
 ELEMENTS, ELEMENTS_SD = "error of the elements", 0.5  # relative: for orders of convergence of 1 to 2, where 1.5 is taken
 FRICTION_SD = 1.0
@@ -148,14 +151,17 @@ def _less_elements(fit: LoadCaseFit, moved: FloatArray) -> LoadCaseFit:
     return replace(fit, residual=fit.residual - moved, jacobian=np.concatenate([fit.jacobian, moved[:, :, None]], axis=2))
 
 
-def with_considered(body: Specimen, parameters: ParameterSet) -> ParameterSet:
-    """Return the parameters of a specimen with those that were taken for known, and are not, free within their priors."""
+def with_considered(body: Specimen, parameters: ParameterSet, shapes: Sequence[str] = tuple(SHAPE_SD)) -> ParameterSet:
+    """Return the parameters of a specimen with those that were taken for known, and are not, free within their priors.
+
+    Of laws these are `shapes`, where the law of the specimen does not have them.
+    """
     have, experiment = parameters.values(), body.experiment
     freed: dict[str, Parameter] = {}
     new = [
         Parameter(name, 0.0, "", prior_sd=SHAPE_SD[kind])
         for m in experiment.materials
-        for kind in SHAPE_SD
+        for kind in shapes
         if kind not in SHAPE_NAMES.get(body.law.name, ()) and (name := shape_parameter(m, kind)) not in have
     ]
     if (name := pixel_scale(experiment)) not in have:

@@ -11,7 +11,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.experiment import Experiment, State
 from naibu.core.parameters import Parameter
 from naibu.core.rigid_transform import registration
-from naibu.identification.from_markers.consider_parameters import with_considered
+from naibu.identification.from_markers.consider_parameters import PREDICTED_SHAPES, with_considered
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
 from naibu.identification.from_markers.specimen.marker_grid import FILLED_SD_MM
 from naibu.identification.from_markers.specimen.parameter_names import platen_position
@@ -123,9 +123,8 @@ def predict_state(
     start, sd = stated_platen_position(model, experiment, target, platen_position_mm, notes)
     wanted = wanted.changed({name: Parameter(name, start, "mm", prior_sd=sd or 1.0)})
     load_case = _unmeasured(body, state, model)
-    solved = solve_state(
-        load_case, with_considered(body, wanted), name, markers=target if heights_from_markers else None, warm_start=warm_start
-    )
+    parameters = with_considered(body, wanted, PREDICTED_SHAPES)
+    solved = solve_state(load_case, parameters, name, markers=target if heights_from_markers else None, warm_start=warm_start)
     if solved.gauge is not None:
         notes.append(source_of_platen_position(solved.gauge, solved.parameters.values()[name]))
     return _finished(model, target, solved, name, sd, [p.name for p in wanted], notes)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.from_markers.calibration import Calibration
-from naibu.identification.from_markers.consider_parameters import ELEMENTS, Considered, considered
+from naibu.identification.from_markers.calibration import SHAPE_SD, Calibration
+from naibu.identification.from_markers.consider_parameters import ELEMENTS, PREDICTED_SHAPES, Considered, considered
 from naibu.identification.from_markers.observations import LoadCaseFit
 from naibu.identification.from_markers.specimen.specimen_model import Specimen
 
@@ -90,11 +90,12 @@ def predictive_uncertainty(calibration: Calibration, known: Considered | None = 
         The tangent at a solution is singular.
     """
     c, match = known or considered(calibration), calibration.match
-    kept = np.array([name != ELEMENTS for name in c.names])
-    everything = np.ones(len(kept), dtype=bool)
-    shift = c.shift(everything)
-    moment = (c.covariance(everything) + np.outer(shift, shift))[np.ix_(kept, kept)]
-    names = tuple(name for name in c.names if name != ELEMENTS)
+    others = tuple(f": {kind}" for kind in SHAPE_SD if kind not in PREDICTED_SHAPES)
+    free = c.sought | np.array([not name.endswith(others) for name in c.names])
+    kept = free & np.array([name != ELEMENTS for name in c.names])
+    shift = c.shift(free)
+    moment = (c.covariance(free) + np.outer(shift, shift))[np.ix_(kept, kept)]
+    names = tuple(name for name, told in zip(c.names, kept, strict=True) if told)
     states = {
         t.name: CalibratedState(t.specimen.experiment.loading.kind, strain_at_markers(t.specimen, match.parameters.values(), f))
         for t, f in zip(calibration.load_cases, match.fits, strict=True)
