@@ -69,3 +69,4 @@ def test_the_readme_says_what_the_records_say() -> None:
     values = {row[0]: row[1] for row in record("interval_coverage")["tables"][0]["rows"]}  # type: ignore[index]
     assert f"{values['RMS error of the ratio of moduli, %']:.1f} %" in reach
     assert f"{values[next(name for name in values if 'held the truth' in name)]:.0f} % of cases" in reach
+    assert f"in {values['the same with the law taken for right, %']:.0f} %" in reach

@@ -154,7 +154,9 @@ def identify_jointly(
     )
     parts = (told_by_markers(from_markers.model), told_by_fields(from_fields.estimate))
     joint = joint_estimate(parts)
-    table = table_of_moduli(parts, joint, relative=from_fields.relative)
+    bounds = from_fields.estimate.intervals()[0].tolist()
+    of_fields_alone = {young_modulus(name): (low, high) for name, (low, high) in zip(from_fields.estimate.zones.names, bounds, strict=True)}
+    table = table_of_moduli(parts, joint, of_fields_alone, relative=from_fields.relative)
     model = joint_model(from_markers.calibration, from_markers.model, from_fields.body, from_fields.estimate, joint)
     notes = (*_in_words(joint, parts), *(f"Doubtful: {doubt}." for doubt in model.doubts), *model.notes)
     result = JointIdentification(from_markers, from_fields, joint, model, table, notes)
@@ -185,16 +187,20 @@ def _require_one_scale(materials: KnownMaterials | None, zones: KnownZones) -> N
     )
 
 
-def table_of_moduli(parts: Sequence[NormalEstimate], joint: JointEstimate, *, relative: bool) -> Table:
-    """Return the table of parameters: from markers, from fields, and from both, with 95 % intervals."""
+def table_of_moduli(
+    parts: Sequence[NormalEstimate], joint: JointEstimate, of_fields: Mapping[str, tuple[float, float]] | None = None, *, relative: bool
+) -> Table:
+    """Return the table of parameters: from markers, from fields, and from both, with 95 % intervals.
+
+    `of_fields` are the bounds that fields alone gave where these are not those of a normal distribution.
+    """
     rows: list[tuple[Cell, ...]] = []
     for name in joint.together.names:
         cells: list[Cell] = [_readable(name)]
-        for part in (*parts, joint.together):
+        for i, part in enumerate((*parts, joint.together)):
             if name in part.names and np.isfinite(part.standard_deviation(name)):
-                cells += [
-                    float(v) for v in _physical(name, part.value(name) + part.standard_deviation(name) * np.array([0.0, -WIDTH, WIDTH]))
-                ]
+                told = _physical(name, part.value(name) + part.standard_deviation(name) * np.array([0.0, -WIDTH, WIDTH])).tolist()
+                cells += [told[0], *((of_fields or {}).get(name, told[1:]) if i == 1 else told[1:])]
             else:
                 cells += [None] * 3
         rows.append(tuple(cells))

@@ -59,7 +59,7 @@ def test_moduli_do_not_follow_the_noise_that_the_surface_takes_up() -> None:
     assert (np.abs(after) < 2.0 * np.std(found, axis=0) / np.sqrt(len(found))).all()
     low, high = np.transpose(bounds)
     assert ((low < 5.0) & (high > 5.0)).sum() >= 11
-    assert (np.log(5.0 / low) > np.log(high / 5.0)).mean() > 0.5  # soft bodies are told less
+    assert np.log(5.0 / low).mean() > 1.2 * np.log(high / 5.0).mean()  # soft bodies are told less
 
 
 @pytest.mark.parametrize("law", ["linear", "neo_hookean"])

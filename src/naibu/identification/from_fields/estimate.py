@@ -291,41 +291,35 @@ class _Recipe:
         """Return the regions as the result if they explain the measurements, else the field under the penalty."""
         target = self.model.n_free
         limit = max(field.chi_squared, target) + UNEXPLAINED * float(np.sqrt(2.0 * target))
+        misfit, count = regions.point.misfit, regions.zones.count
         self.record(
-            f"{regions.clusters} clusters made {regions.zones.count} regions ({regions.moved} zones changed sides): "
-            f"misfit {regions.point.misfit:.4g} without penalty"
+            f"{regions.clusters} clusters made {count} regions ({regions.moved} zones changed sides): misfit {misfit:.4g} without penalty"
         )
-        sharp = self._with_borders(regions, graph, limit)
-        if sharp is None:
+        if misfit > limit:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
             words = (NO_REGIONS, *field.identifiability)
             return replace(field, segmentation=regions, steps=tuple(self.steps), identifiability=words)
+        sharp = self._with_borders(regions, graph)
         return replace(
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
             identifiability=(*sharp.identifiability, *field.identifiability),
         )  # fmt: skip
 
-    def _with_borders(self, regions: Segmentation, graph: ZoneGraph, limit: float) -> FieldEstimate | None:
-        """Return the fit of regions, where there are few of single cells with borders through these; None if its misfit exceeds a limit."""
-
-        def of_cells() -> FieldEstimate | None:
-            return self._sharp(regions.zones, regions.point, None) if regions.point.misfit <= limit else None
-
+    def _with_borders(self, regions: Segmentation, graph: ZoneGraph) -> FieldEstimate:
+        """Return the fit of regions whose borders run through cells, where there are few regions in a map of single cells."""
         single = graph.count == int((self.model.zones.of_cell != KNOWN).sum()) and self.model.mesh.dimension == 3
         if not single or not 1 < regions.zones.count <= MOST_REGIONS:
-            return of_cells()
+            return self._sharp(regions.zones, regions.point, None)
         try:
             refined = refined_regions(self.model, regions, graph, self.bounds)
         except ConvergenceError:
             self.record("no equilibrium was found with borders within cells: those on faces of cells are kept")
-            return of_cells()
+            return self._sharp(regions.zones, regions.point, None)
         charge = float(np.log(self.model.n_free) + np.log(graph.count)) * (regions.zones.count - refined.zones.count)
         if not 0.5 * refined.point.misfit < 0.5 * regions.point.misfit + charge:
             self.record("borders within cells explain no more than those on faces of cells, which are kept")
-            return of_cells()
+            return self._sharp(regions.zones, regions.point, None)
         self.record(f"borders of {refined.zones.count} regions within cells: misfit {refined.point.misfit:.4g}")
-        if refined.point.misfit > limit:
-            return None
         corrected = self._corrected(refined)
         refined = refined if corrected is None else corrected.refined
         model = self.model.with_zones(refined.zones)

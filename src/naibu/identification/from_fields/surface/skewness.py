@@ -22,7 +22,7 @@ NEAR = 0.35  # how far from that they may come out for the distance to be taken 
 LEAST, MOST = 0.04, 0.7  # standard deviations of ln E: below, these hardly change within an interval; beyond, nothing is determined
 FURTHER, LONGEST = 2.5, 2.5  # times as far as one test is the next at most; and the farthest logarithm from the estimate
 TESTS = 3  # on each side
-NEAREST, FARTHEST = 0.7, 4.0  # times as far as the standard deviation at the estimate says
+NEAREST, FARTHEST = 1.0, 4.0  # times as far as the standard deviation at the estimate says
 
 
 def distances_of_bounds(score: CorrectedScore, found: Uncertainty, variance: float, noise_factor: float) -> FloatArray:
