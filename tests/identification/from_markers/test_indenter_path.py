@@ -100,9 +100,12 @@ def test_an_angle_known_from_another_state_is_as_uncertain_as_there() -> None:
     solved = predict_state(model, markers, "further")
     assert solved.values[side_plate_tilt(markers, "further")] == pytest.approx(0.015)
     certain = replace(model, covariance=np.where(np.eye(len(variances), dtype=bool), 1e-6, 0.0))
-    # along the plates' motion; the angle is not better known than where it was found
-    known, unknown = (np.median(p.sd_model_mm[:, 1]) for p in (predict_state(certain, markers, "further"), solved))
-    assert unknown > 1.1 * known
+    turned = replace(model, parameters=parameters.with_values({angle: 0.015 + sd}))
+    known, leaning = (predict_state(m, markers, "further") for m in (certain, turned))
+    # the angle is not better known than where it was found: its standard deviation moves markers as far as turning the plates by it does
+    moved = np.abs(leaning.residual - solved.residual)[:, 1]
+    added = np.sqrt(np.maximum(solved.sd_model_mm**2 - known.sd_model_mm**2, 0.0))[:, 1]
+    assert np.median(added) == pytest.approx(np.median(moved), rel=0.05)
 
 
 @pytest.mark.parametrize("kind", ["side_plates", "plate", "bar"])
