@@ -195,12 +195,14 @@ def _mask_doubts(mask: BoolArray, left: LeftOut) -> tuple[str, ...]:
         )
     if left.surrounded > LEFT_OUT:
         doubts.append(
-            f"Space within the object that is open to the outside, {left.surrounded:.0%} of the object's volume, is left out of its mask: "
+            f"Space within the object that is open to the outside, {100.0 * left.surrounded:.0f} % of the object's volume, is left out of "
+            "its mask: "
             "it is as dark as the air outside, and no denser. If it belongs to the object, give a `mask`."
         )
     if left.separate > SEPARATE:
         doubts.append(
-            f"Bright regions apart from the object, {left.separate:.0%} of its volume, are left out of its mask, which holds the largest "
+            f"Bright regions apart from the object, {100.0 * left.separate:.0f} % of its volume, are left out of its mask, which holds "
+            "the largest "
             "region only. If they belong to the object, as a second lung or leg does, give a `mask` of all of it."
         )
     return tuple(doubts)
@@ -409,7 +411,8 @@ def _convergence_doubts(unconverged: int, cells: int) -> tuple[str, ...]:
     if not unconverged:
         return ()
     return (
-        f"{unconverged} of {cells} cells of the grid ({unconverged / cells:.1%}) have not converged: their displacement is less certain, "
+        f"{unconverged} of {cells} cells of the grid ({100.0 * unconverged / cells:.1f} %) have not converged: their displacement is less "
+        "certain, "
         "which its standard deviation includes.",
     )
 
@@ -418,6 +421,7 @@ def _misplacement_doubts(fraction: float) -> tuple[str, ...]:
     if fraction < APART:
         return ()
     return (
-        f"In {fraction:.0%} of the object structures stay more than a voxel apart after registration, as where parts slide on each other "
+        f"In {100.0 * fraction:.0f} % of the object structures stay more than a voxel apart after registration, as where parts slide on "
+        "each other "
         "or tear: the displacement near them is less certain, which its standard deviation includes. A `mask` of one part measures it.",
     )

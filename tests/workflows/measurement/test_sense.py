@@ -147,7 +147,7 @@ def test_a_field_that_folds_is_named_on_the_page(folder: Path) -> None:
     )
     plt.close(figure)
     folded = replace(run, figures=run.figures | {"folded_fraction": 0.125})
-    assert any("folds at 12.50%" in sentence for sentence in slice_view(pair, folded).sentences)
+    assert any("folds at 12.50 %" in sentence for sentence in slice_view(pair, folded).sentences)
 
 
 def test_the_page_states_positions_of_the_scan_and_the_part_that_was_not_measured() -> None:
@@ -159,7 +159,7 @@ def test_the_page_states_positions_of_the_scan_and_the_part_that_was_not_measure
     np.testing.assert_allclose(view.origin_mm, before.to_physical(np.maximum(first, 0)), atol=1e-9)
     assert not any("not measured" in sentence for sentence in view.sentences)
     part = replace(run, figures={**run.figures, "measured_fraction": 0.75})
-    assert any("25.0% of the object was not measured" in sentence for sentence in slice_view(pair, part).sentences)
+    assert any("25.0 % of the object was not measured" in sentence for sentence in slice_view(pair, part).sentences)
 
 
 def test_both_scans_may_have_a_mask_and_doubts_are_on_every_page(folder: Path, tmp_path: Path) -> None:

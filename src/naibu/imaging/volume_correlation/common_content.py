@@ -80,7 +80,8 @@ class CommonContent:
         share, other = float(self.matched[inner].mean()), inner & ~self.matched
         if share < LEAST_MATCHED and float(np.median(self.structure[other])) > STRUCTURED:
             raise InputError(
-                f"the volumes match in {share:.0%} of the object only, and what is left elsewhere after registration has the structure of "
+                f"the volumes match in {100.0 * share:.0f} % of the object only, and what is left elsewhere after registration has the "
+                "structure of "
                 f"an image (autocorrelation {np.median(self.structure[other]):.2f} at {LAG} voxels; that of noise is below "
                 f"{STRUCTURED:g}): "
                 "check that both show the same object; where it has no texture only markers can be followed (naibu.imaging.detect_markers)"
@@ -198,7 +199,8 @@ def require_overlap(seen: float) -> None:
     """
     if seen < LEAST_OVERLAP:
         raise InputError(
-            f"only {seen:.1%} of the object lies in the deformed volume after its motion: the volumes do not overlap, or do not show the "
+            f"only {100.0 * seen:.1f} % of the object lies in the deformed volume after its motion: the volumes do not overlap, or do not "
+            "show the "
             "same object"
         )
 
@@ -213,6 +215,7 @@ def require_convergence(moving: float) -> None:
     """
     if moving > MOST_MOVING:
         raise InputError(
-            f"no displacement fits the volumes: {moving:.0%} of the object had not converged after the last step; check that both show the "
+            f"no displacement fits the volumes: {100.0 * moving:.0f} % of the object had not converged after the last step; check that "
+            "both show the "
             "same object, and give masks of it if there is much else in them"
         )

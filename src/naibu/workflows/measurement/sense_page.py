@@ -129,11 +129,12 @@ def _sentences(run: SenseRun) -> list[str]:
         sentences.append("This method states no uncertainty.")
     if isinstance(f["measured_fraction"], float) and f["measured_fraction"] < 0.995:
         sentences.append(
-            f"The displacement of {1.0 - f['measured_fraction']:.1%} of the object was not measured: that part lies outside one of the "
+            f"The displacement of {100.0 * (1.0 - f['measured_fraction']):.1f} % of the object was not measured: that part lies outside "
+            "one of the "
             "scans, or in its padding, or the scans show no common texture there."
         )
     if folds:
-        sentences.append(f"The field folds at {f['folded_fraction']:.2%} of the voxels: it is wrong there.")
+        sentences.append(f"The field folds at {100.0 * f['folded_fraction']:.2f} % of the voxels: it is wrong there.")
     return sentences + [text.replace("`", "") for text in run.measured.warnings]
 
 

@@ -70,7 +70,8 @@ class MotionCoherence:
             return f"lengths changed {_factor(self.span_ratio)}, which no soft body does: {_units(self.span_ratio)}"
         if len(self.judged) and self.found_again < FOUND_AGAIN:
             return (
-                f"only {self.found_again:.0%} of {len(self.judged)} markers lie nearest to where the motion of their neighbours predicts "
+                f"only {100.0 * self.found_again:.0f} % of {len(self.judged)} markers lie nearest to where the motion of their neighbours "
+                "predicts "
                 "them: the labels of the two states do not correspond (row numbers?); number the markers alike in all states, or let "
                 "track or link_markers link them"
             )

@@ -211,7 +211,8 @@ def _best_grown(cloud: Cloud, rng: np.random.Generator, stretch: FloatArray, how
             return best[1]
     if best is None or best[1].count < max(FEWEST, LEAST_LINKED * smaller):
         raise InputError(
-            f"no common structure in {len(cloud.reference)} and {len(cloud.deformed)} markers: at best {most_seen:.0%} of the neighbours "
+            f"no common structure in {len(cloud.reference)} and {len(cloud.deformed)} markers: at best {100.0 * most_seen:.0f} % of the "
+            "neighbours "
             "of a marker are found again under one affine motion. Check that both are in mm and of one object"
         )
     return best[1]
