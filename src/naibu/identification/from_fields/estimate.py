@@ -396,7 +396,7 @@ class _Recipe:
                 layers, apart = np.isin(names, thin) if thin else None, np.isin(names, judged.mesh_dependent)
                 change, mixed = relative_change(shift), self.region_at is not None or not alike or model.surface_sought
                 covariance = doubt_in_all(change, sure, quadratic.hessian, apart, mixed=mixed, thin=layers)
-                coarse = bool(thin) or float(np.abs(change[sure]).max(initial=0.0)) > COARSE
+                coarse = bool(sure.any()) and (bool(thin) or float(np.abs(change[sure]).max(initial=0.0)) > COARSE)
             else:
                 covariance, coarse = corrected.doubt, not corrected.converged
             covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))

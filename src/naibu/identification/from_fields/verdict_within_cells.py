@@ -23,6 +23,10 @@ WITHIN = 0.5  # change of a logarithm from which a linear correction is worth no
 DETERMINED = 0.5  # standard deviation of a logarithm from measurement alone: 95 % intervals up to 7 times as high as low are determined
 NUMBERS = ("Young's modulus", "the shear modulus", "kappa / mu, hence Poisson's ratio,")
 ROUGHLY = 0.15  # standard deviation of ln E with which a modulus is known within a third, at 95 %
+NO_INFORMATION = (
+    "the measurement determines no Young's modulus (standard deviation of the logarithm {:.2g} or more), whatever the size of elements: "
+    "measure more points or another load, or name the sides where forces act"
+)
 FALLS = 0.75  # part of the misfit beyond noise that may be left on elements of half the size for these to be what explains it
 
 
@@ -101,7 +105,7 @@ def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize, s
     if (lost <= apart).all() and (sure[0] & ~lost).any():
         return _without(judged, names, refused, half)
     reason = f"zones end inside of elements, and with half their size moduli would change {half.times[refused].max():.2g} times"
-    advised = f"{reason}: use smaller ones"
+    advised = f"{reason}: use smaller ones" if sure[0].any() else NO_INFORMATION.format(float(half.standard_deviations[0].min()))
     reasons = (advised, *judged.reasons)
     if judged.explanation is not Explanation.EXPLAINED and judged.shared > SHARED and not half.falls:
         reasons = (*judged.reasons, f"elements of half the size leave such residuals as well; but {reason}")

@@ -15,7 +15,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress
-from naibu.identification.from_fields.assumptions import Assumption
+from naibu.identification.from_fields.assumptions import Assumption, hangs_on_law
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
@@ -149,7 +149,9 @@ def _relative(found: FieldEstimate, few: str = "") -> FieldEstimate:
     others = tuple(replace(one, theta=_divided(one.theta, _of_unit(one, found.theta, zone))) for one in found.assumptions)
     regularized = found.regularized and (found.regularized[0] / np.exp(unit), found.regularized[1])
     assert found.verdict is not None  # of regions that were fitted without a penalty
-    judged = with_limits(replace(found.verdict, limits=few), found.zones.names, None, intervals(theta, uncertainty)[0], "")
+    bounds = intervals(theta, uncertainty)[0]
+    of_law = hangs_on_law(others, theta, bounds)
+    judged = with_limits(replace(found.verdict, limits=few), found.zones.names, None, bounds, "", of_law=of_law)
     found = replace(found, verdict=judged)
     return replace(
         found, theta=theta, uncertainty=uncertainty, assumptions=others, regularized=regularized, budget=None,
@@ -158,9 +160,13 @@ def _relative(found: FieldEstimate, few: str = "") -> FieldEstimate:
 
 
 def _of_unit(other: Assumption, theta: FloatArray, zone: int) -> float:
-    """Return by how much another assumption changes the logarithm of Young's modulus of a zone."""
-    after, before = (young_and_poisson(t)[0][zone] for t in (other.applied(theta), theta))
-    return float(np.log(after / before))
+    """Return by how much another assumption changes the logarithm of Young's modulus of a zone.
+
+    Of logarithms alone: where one cell is all that is known, to first order the factor that it tells may change beyond all numbers.
+    """
+    k = len(theta) // 2
+    after, before = (np.log(young_and_poisson(np.array([0.0, t[k + zone]]))[0][0]) for t in (other.applied(theta), theta))
+    return float(other.theta[zone] + after - before)
 
 
 def _divided(theta: FloatArray, unit: float) -> FloatArray:

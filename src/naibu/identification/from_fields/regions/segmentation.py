@@ -143,7 +143,9 @@ def _ward(pairs: IntArray, means: FloatArray, volume: FloatArray, most: int) -> 
     return np.unique(owner, return_inverse=True)[1].astype(np.int64)
 
 
-def merged(quadratic: Concentrated, theta: FloatArray, area: FloatArray, weight: float, charge: float) -> tuple[IntArray, FloatArray]:
+def merged(
+    quadratic: Concentrated, theta: FloatArray, area: FloatArray, weight: float, charge: float, most: int | None = None
+) -> tuple[IntArray, FloatArray]:
     """Merge clusters while that lowers the objective, all other moduli adapting at once.
 
     Parameters
@@ -158,6 +160,8 @@ def merged(quadratic: Concentrated, theta: FloatArray, area: FloatArray, weight:
         Of total variation, 1/mm^2.
     charge : float
         What a region costs.
+    most : int, optional
+        How many pairs are merged at most.
 
     Returns
     -------
@@ -175,7 +179,7 @@ def merged(quadratic: Concentrated, theta: FloatArray, area: FloatArray, weight:
         covariance = np.linalg.inv(both.T @ hessian @ both)
         best = covariance @ (both.T @ right)
         gains = _gains_of_merging(best, covariance, gather.T @ area @ gather, weight) + charge
-        if gains.size == 1 or not gains.max() > 0.0:
+        if gains.size == 1 or not gains.max() > 0.0 or k - len(gather.T) == most:
             return gather.argmax(axis=1).astype(np.int64), best
         i, j = sorted(np.unravel_index(int(np.argmax(gains)), gains.shape))
         gather[:, i] += gather[:, j]
@@ -344,28 +348,52 @@ def jump_costs(jump: FloatArray) -> FloatArray:
 def _from_clusters(
     model: FieldModel, criterion: Criterion, start: Point, bounds: Bounds, most: int, progress: Progress | None
 ) -> tuple[IntArray, Point, int]:
-    """Merge clusters, fit regions and mend their borders until nothing changes; returns regions, their fit, and how many zones moved."""
+    """Merge clusters, fit regions and mend their borders until nothing changes; returns regions, their fit, and how many zones moved.
+
+    Merging goes by a quadratic approximation, which says nothing far away: that of a lump of too few cells, nearly empty, knows no
+    stiffer one. What it merged counts only if the fit confirms it, first all of it, then a pair at a time.
+    """
     graph = criterion.graph
     labels = clusters(graph, start.theta, most)
     volume = np.bincount(labels, graph.volume)
     theta = np.concatenate([np.bincount(labels, graph.volume * t) / volume for t in start.theta.reshape(2, -1)])
     point, moved, near = _at(model.with_zones(joined(model.zones, labels)), theta, start), 0, None
+    best = np.inf
     for _ in range(ROUNDS):
-        fitted = model.with_zones(joined(model.zones, labels))
-        quadratic = fitted.linearised(point).concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE, near)
-        scaled = _scaled(quadratic, criterion.scale)
-        united, theta = merged(scaled, point.theta, areas_between(graph, labels), criterion.weight, criterion.charge)
-        before, labels = int(labels.max()), united[labels]
-        gather = np.kron(np.eye(2), np.eye(int(united.max()) + 1)[united])
-        labels, found = _refitted(model, labels, theta, point, bounds, progress, [x @ gather for x in quadratic.response])
-        point, near, changed = found.point, found.response, 0
+        quadratic = model.with_zones(joined(model.zones, labels)).linearised(point).concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE, near)
+        end = _lowered(model, criterion, (labels, point, quadratic), best, bounds, progress)
+        if end is None:
+            break
+        before, changed = int(labels.max()), 0
+        labels, found = end
+        point, near = found.point, found.response
         if graph.count <= EXPLICIT and int(labels.max()) > 0:
             labels, point, changed = _with_better_borders(model, criterion, labels, point, bounds, progress)
             near = None if changed else near
-        moved += changed
+        moved, best = moved + changed, criterion.value(labels, point)
         if not changed and before == int(labels.max()):
             break
     return labels, point, moved
+
+
+def _lowered(
+    model: FieldModel,
+    criterion: Criterion,
+    here: tuple[IntArray, Point, Concentrated],
+    below: float,
+    bounds: Bounds,
+    progress: Progress | None,
+) -> tuple[IntArray, Found] | None:
+    """Return merged regions with a fit that costs less than `below`, or whatever it costs if nothing was merged; None if there are none."""
+    labels, point, quadratic = here
+    scaled, area = _scaled(quadratic, criterion.scale), areas_between(criterion.graph, labels)
+    for most in (len(area), 1):
+        united, theta = merged(scaled, point.theta, area, criterion.weight, criterion.charge, most)
+        gather = np.kron(np.eye(2), np.eye(int(united.max()) + 1)[united])
+        new, found = _refitted(model, united[labels], theta, point, bounds, progress, [x @ gather for x in quadratic.response])
+        if int(united.max()) + 1 == len(area) or criterion.value(new, found.point) < below:
+            return new, found
+    return None
 
 
 def _at(model: FieldModel, theta: FloatArray, near: Point) -> Point:
