@@ -51,14 +51,15 @@ def towards(start: FloatArray, target: FloatArray, reach: float) -> FloatArray:
     return np.asarray(target if length <= reach else start + way * (reach / length), dtype=float)
 
 
-def waiting_place(tool: RigidIndenter, positions: FloatArray, step_mm: float) -> FloatArray:
-    """Return where a tool waits (3,), mm: where it was made, raised by steps until it is clear of the surface at positions (n, 3), mm."""
+def waiting_place(tool: RigidIndenter, points: FloatArray, step_mm: float) -> FloatArray:
+    """Return where a tool waits (3,), mm: where it was made, raised by steps until it is clear of points (n, 3), mm, of the body."""
     centre = np.array(tool.centre, dtype=float)
     for _ in range(MOST_RAISED):
-        if placed(tool, centre).gap(positions).min() > 0.0:
-            break
+        if placed(tool, centre).gap(points).min() > 0.0:
+            return centre
         centre[2] += step_mm
-    return centre
+    below = tool.geometry.reach(np.array([0.0, 0.0, -1.0]))
+    return np.array([*centre[:2], float(points[:, 2].max()) + below + step_mm])
 
 
 def farthest_in_a_step(tool: RigidIndenter) -> float:
