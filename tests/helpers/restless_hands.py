@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,10 +15,11 @@ from naibu.simulation import InteractiveSimulation
 
 FRAME = ""  # instead of a message: the next frame
 JUNK = (
-    "", "{", "[]", "null", '{"type": "explode"}', '{"type": "move"}', '{"type": "move", "at": [1, 2]}', '{"type": "move", "at": [NaN, 0, 0]}',
-    '{"type": "move", "at": [Infinity, 0, 0]}', '{"type": "pull", "at": [0, 0, 1e300]}', '{"type": "turn", "by": [9, 0, 0]}',
-    '{"type": "grip", "node": -1}', '{"type": "grip", "node": true}', '{"type": "grip", "node": 2147483647}', '{"type": "tool", "name": "axe"}',
-    '{"type": "cut", "edges": []}', '{"type": "cut", "edges": [[[0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0]]]}',
+    "", "{", "[]", "null", '{"type": "explode"}', '{"type": "move"}', '{"type": "move", "at": [1, 2]}',
+    '{"type": "move", "at": [NaN, 0, 0]}', '{"type": "move", "at": [Infinity, 0, 0]}', '{"type": "pull", "at": [0, 0, 1e300]}',
+    '{"type": "turn", "by": [9, 0, 0]}', '{"type": "grip", "node": -1}', '{"type": "grip", "node": true}',
+    '{"type": "grip", "node": 2147483647}', '{"type": "tool", "name": "axe"}', '{"type": "cut", "edges": []}',
+    '{"type": "cut", "edges": [[[0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0]]]}',
     '{"type": "cut", "edges": [[[0, 0, 0], [9, 0, 0]], [[0, 0, 0], [NaN, 0, 0]]]}', '{"type": "pause", "on": 1}', "[" * 5000,
 )  # fmt: skip
 
@@ -45,8 +46,9 @@ class RestlessHands:
     def messages(self) -> Iterator[str]:
         """Yield messages as the page sends them, and `FRAME` where it waits for the next frame; without end."""
         habits: list[tuple[float, Callable[[], Iterator[str]]]] = [
-            (5.0, self.press), (1.5, self.rush), (1.0, self.plunge), (2.0, self.pull), (1.0, self.change_tool), (0.7, self.turn_while_pressing),
-            (1.0, self.undo), (0.4, self.reset), (0.5, self.pause), (0.5, self.record), (0.7, self.junk), (1.0, self.wait),
+            (5.0, self.press), (1.5, self.rush), (1.0, self.plunge), (2.0, self.pull), (1.0, self.change_tool),
+            (0.7, self.turn_while_pressing), (1.0, self.undo), (0.4, self.reset), (0.5, self.pause), (0.5, self.record),
+            (0.7, self.junk), (1.0, self.wait),
             (2.0 if self.cuts else 0.0, self.cut),
         ]  # fmt: skip
         weights = np.array([weight for weight, _ in habits])
@@ -211,8 +213,3 @@ def _unit(vector: FloatArray) -> FloatArray:
 def _said(kind: str, **values: Any) -> str:
     plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in values.items()}
     return json.dumps({"type": kind, **plain})
-
-
-def said_in(messages: Sequence[str], kind: str) -> int:
-    """Return how many of some messages are of a kind."""
-    return sum(f'"type": "{kind}"' in message for message in messages)

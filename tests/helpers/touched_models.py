@@ -21,7 +21,9 @@ from naibu.workflows.interactive.touchable_models import touchable
 def repeatable(model: TouchableModel) -> TouchableModel:
     """Return a model whose tangents no thread renews."""
     body = model.body
-    return replace(model, body=replace(body, engine=replace(body.engine, background=False))) if isinstance(body, FiniteElementBody) else model
+    return (
+        replace(model, body=replace(body, engine=replace(body.engine, background=False))) if isinstance(body, FiniteElementBody) else model
+    )
 
 
 def small_lattice() -> TouchableModel:

@@ -28,6 +28,7 @@ from naibu.workflows.interactive.live import BUDGET_S, DELAY_S, LiveSimulation  
 
 MOST_DISPLACED = 6.0  # extents of the body; further only pieces that nothing holds
 MOST_KEPT = 20
+STILL = 0.02  # extents a second
 
 
 @dataclass(slots=True)
@@ -55,6 +56,9 @@ class WatchedPage:
     slow: list[tuple[float, int, str]] = field(init=False, default_factory=list)
     said: collections.Counter[str] = field(init=False, default_factory=collections.Counter)
     frames: int = field(init=False, default=0)
+    left: float = field(init=False, default=0.0)  # extents, from the shape at rest, after all hands were taken away
+    fastest: float = field(init=False, default=0.0)  # extents a second, of any node
+    farthest: float = field(init=False, default=0.0)  # extents, of any node from where it is at rest
     page: LiveSimulation = field(init=False)
     _clock: float = field(init=False, default=0.0)
     _due: float = field(init=False, default=0.0)
@@ -106,6 +110,35 @@ class WatchedPage:
             self.slow.append((round(took, 2), self.frames, self._doing))
         self._look()
 
+    def let_go(self, wait_s: float) -> float:
+        """Take every hand away, wait, and return how far the body then is from its shape at rest, a rigid motion aside, in extents."""
+        for message in (
+            '{"type": "pause", "on": false}',
+            '{"type": "record", "on": false}',
+            '{"type": "release"}',
+            '{"type": "tool", "name": ""}',
+        ):
+            self.say(message)
+        while self.page.loop._replay:
+            self.frame()
+        for _ in range(round(wait_s / self.simulation.frame_s)):
+            self.frame()
+        last = self.simulation.last
+        if last.tool:
+            self._fail(f"{last.tool} did not leave")
+        speed = float(np.linalg.norm(self.simulation._session.state().velocity, axis=1).max()) / self.simulation.extent_mm
+        if speed > STILL and not last.topology:
+            self._fail(f"it still moves at {speed:.3g} extents a second")
+        rest = last.body.points - last.body.points.mean(axis=0)
+        moved = last.positions - last.positions.mean(axis=0)
+        turn = np.eye(3)
+        if not len(last.body.supported):
+            u, _, v = np.linalg.svd(moved.T @ rest)
+            turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+        else:
+            rest, moved = last.body.points, last.positions
+        return float(np.linalg.norm(moved - rest @ turn.T, axis=1).max()) / self.simulation.extent_mm
+
     def _now(self) -> tuple[FloatArray, str, object, int, int]:
         simulation = self.simulation
         kept = simulation._kept
@@ -150,7 +183,9 @@ class WatchedPage:
         for name in ("positions", "force", "pull", "tool_centre", "tool_rotation", "time_s", "unbalanced", "penetration_mm"):
             if not np.isfinite(getattr(frame, name)).all():
                 self._fail(f"{name} is not finite")
-        moved = np.linalg.norm(frame.positions - frame.body.points, axis=1).max() / extent
+        moved = float(np.linalg.norm(frame.positions - frame.body.points, axis=1).max()) / extent
+        self.farthest = max(self.farthest, moved)
+        self.fastest = max(self.fastest, float(np.linalg.norm(self.simulation._session.state().velocity, axis=1).max()) / extent)
         if moved > MOST_DISPLACED and not frame.topology:
             self._fail(f"the body is {moved:.3g} extents away")
         frame_bytes(self.page.frame(), True, frame.body.strain(frame.positions) if self.frames % 50 == 0 else None)
@@ -159,7 +194,9 @@ class WatchedPage:
         self.failures.append(f"frame {self.frames}, {self._doing}: {what}")
 
 
-def driven(model: TouchableModel, seed: int, frames: int, *, cuts: bool = True, as_live: bool = False) -> WatchedPage:
+def driven(
+    model: TouchableModel, seed: int, frames: int, *, cuts: bool = True, as_live: bool = False, settling_s: float = 0.0
+) -> WatchedPage:
     """Return the page of a model after so many frames in the hands of a seed, closed."""
     page = WatchedPage(model, as_live)
     hands = RestlessHands(page.simulation, np.random.default_rng(seed), cuts)
@@ -169,6 +206,7 @@ def driven(model: TouchableModel, seed: int, frames: int, *, cuts: bool = True, 
                 page.frame()
             else:
                 page.say(message)
+        page.left = page.let_go(settling_s) if settling_s else 0.0
     finally:
         page.close()
     return page
@@ -183,6 +221,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=5)
     parser.add_argument("--frames", type=int, default=300)
+    parser.add_argument("--settling", type=float, default=4.0)
     parser.add_argument("--no-cuts", action="store_true")
     parser.add_argument("--as-live", action="store_true")
     given = parser.parse_args()
@@ -190,7 +229,9 @@ def main() -> int:
     for seed in range(given.seed, given.seed + given.count):
         began = time.process_time()
         try:
-            page = driven(MODELS[given.model](), seed, given.frames, cuts=not given.no_cuts, as_live=given.as_live)
+            page = driven(
+                MODELS[given.model](), seed, given.frames, cuts=not given.no_cuts, as_live=given.as_live, settling_s=given.settling
+            )
         except Exception:
             traceback.print_exc()
             bad += 1
@@ -198,7 +239,11 @@ def main() -> int:
             continue
         bad += bool(page.failures)
         took = time.process_time() - began
-        print(f"{given.model} seed {seed}: {took:.1f} s, slowest frame {page.slowest_s:.2f} s {page.slow[:6]}", flush=True)
+        print(
+            f"{given.model} seed {seed}: {took:.1f} s, slowest frame {page.slowest_s:.2f} s {page.slow[:6]}, "
+            f"topology {page.simulation.last.topology}, fastest {page.fastest:.1f}, farthest {page.farthest:.1f}, left {page.left:.2g}",
+            flush=True,
+        )
         print("   FAIL " + "; ".join(page.failures[:4]) if page.failures else "   ok", dict(page.said), flush=True)
     return int(bad > 0)
 

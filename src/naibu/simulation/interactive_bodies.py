@@ -32,6 +32,7 @@ from naibu.meshing.refinement.forest import BisectionForest
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
 from naibu.simulation.cut_sides import caution_of_cuts, outward_normals, with_sides_of_cuts
 from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
+from naibu.simulation.tool_places import surface_samples
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
 AnySession = Session[Any, Any]
@@ -430,8 +431,7 @@ class FiniteElementBody:
 
     def kept_clear(self, positions: FloatArray) -> FloatArray:
         """Return nodes, middles of edges and centroids of the triangles of the surface (k, 3), mm."""
-        corners = positions[self.faces]
-        return np.concatenate([corners, 0.5 * (corners + np.roll(corners, 1, axis=1)), corners.mean(axis=1, keepdims=True)], axis=1).reshape(-1, 3)
+        return surface_samples(positions, self.faces)
 
 
 def nodes_touching(points: FloatArray, indenters: Sequence[RigidIndenter], tolerance_mm: float = 1e-6) -> IntArray:
