@@ -125,6 +125,7 @@ class Breathing:
             none,
             none,
             0.0,
+            0.0,
             60.0,
             1.0,
             0,

@@ -142,6 +142,21 @@ def test_undo_returns_to_the_state_before() -> None:
     assert not touched.undo()
 
 
+@pytest.mark.parametrize("kind", ["lattice", "gel"])
+def test_a_tool_is_taken_also_where_the_body_was_pulled_around_its_waiting_place(kind: str) -> None:
+    """A sphere that waits between the nodes of a face that came to it: the lattice's contact had refused it, which ended the thread."""
+    touched = InteractiveSimulation(lattice_or_gel(kind), {"sphere": spherical_indenter((15.0, 15.0, 44.0), 3.0)})
+    middle = int(np.linalg.norm(touched.body.points - (20.0, 20.0, TOP), axis=1).argmin())
+    touched.grip(middle, 30.0)
+    touched.pull(touched.body.points[middle] + (0.0, 0.0, 4.0))
+    for _ in range(10):
+        touched.advance()
+    touched.take("sphere")
+    assert touched.last.positions[middle, 2] == pytest.approx(44.0, abs=0.01)
+    frame = touched.advance()
+    assert frame.tool == "sphere" and not frame.force.any() and frame.tool_centre[2] > 47.0
+
+
 def test_reset_brings_the_body_to_rest() -> None:
     touched = simulation()
     touched.take("sphere")

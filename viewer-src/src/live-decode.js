@@ -1,6 +1,6 @@
 // The inverse of naibu/viewer/live/scene.py: the scene from JSON, frames from bytes.
 const FLAGS = { paused: 1, driving: 2, recording: 4, replaying: 8, failed: 16, held: 32, underWay: 64, preparing: 128 };
-const HEADER_BYTES = 112;
+const HEADER_BYTES = 116;
 
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 
@@ -23,7 +23,7 @@ export function decodeScene(payload) {
 export function decodeFrame(buffer) {
   const view = new DataView(buffer);
   const magic = String.fromCharCode(...new Uint8Array(buffer, 0, 4));
-  if (magic !== "NLV4") throw new Error(`this is no frame of naibu: ${magic}`);
+  if (magic !== "NLV5") throw new Error(`this is no frame of naibu: ${magic}`);
   const nodes = view.getUint32(8, true);
   const float = (at) => view.getFloat32(at, true);
   const vector = (at) => [float(at), float(at + 4), float(at + 8)];
@@ -41,13 +41,14 @@ export function decodeFrame(buffer) {
     pull: vector(48),
     centre: vector(60),
     penetration: float(72),
-    stepsPerSecond: float(76),
-    realTime: float(80),
-    unbalanced: float(84),
-    rotation: [...vector(88), float(100)],
-    cutStage: view.getInt32(108, true),
+    indentation: float(76),
+    stepsPerSecond: float(80),
+    realTime: float(84),
+    unbalanced: float(88),
+    rotation: [...vector(92), float(104)],
+    cutStage: view.getInt32(112, true),
     positions: new Float32Array(buffer, HEADER_BYTES, 3 * nodes),
     values: valued ? new Float32Array(buffer, HEADER_BYTES + 12 * nodes, nodes) : null,
-    readings: new Float32Array(buffer, afterNodes, 3 * view.getUint32(104, true)),
+    readings: new Float32Array(buffer, afterNodes, 3 * view.getUint32(108, true)),
   };
 }

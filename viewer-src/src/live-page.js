@@ -89,13 +89,18 @@ class LivePage {
     this.caution = h("p", { class: "note trouble", role: "status" }); // of the tool in play
     this.readout = h("p", { class: "readout", "aria-hidden": "true" }); // where the numbers are too far below to be seen
     this.canvas = h("canvas", { class: "time-curve", role: "img", "aria-label": "Force of the last ten seconds" });
-    this.numbers = Object.fromEntries(["force", "pull", "penetration", "time", "rate", "probe"].map((name) => [name, h("dd", {}, "–")]));
+    this.numbers = Object.fromEntries(["force", "indentation", "overlap", "pull", "time", "rate", "probe"].map((name) => [name, h("dd", {}, "–")]));
     this.plots = new ReadingPlots(this.scene.readings);
     this.notice = new CutNotice(this.scene.cut_stages);
     this.undo = this.#button("↺ Undo", () => this.back("undo"));
     this.reset = this.#button("Reset", () => this.back("reset"));
     this.conflicting = [...this.modes.filter((b) => ["cut", "pull"].includes(b.dataset.mode)), this.toolChoice, this.undo, this.reset];
-    const labels = { force: "force of the tool", pull: "force of the pull", penetration: "penetration", time: "simulated time", rate: "rate", probe: "probed point" };
+    const labels = {
+      force: "force of the tool", indentation: "indentation depth", overlap: "overlap with the tool", pull: "force of the pull",
+      time: "simulated time", rate: "rate", probe: "probed point",
+    };
+    this.numbers.indentation.title = "how deep the tool lies, along its force, below where the surface is at rest; where the body has moved as a whole, its way is part of it";
+    this.numbers.overlap.title = "how far nodes of the surface lie in the tool as the contact yields; not how deep the tool presses";
     const list = h("dl", { class: "numbers" }, ...Object.entries(labels).flatMap(([name, text]) => [h("dt", {}, text), this.numbers[name]]));
     root.replaceChildren(
       h("div", { class: "bar" }, h("div", { class: "modes", role: "group", "aria-label": "What dragging does" }, ...this.modes),
@@ -340,7 +345,8 @@ class LivePage {
     numbers.pull.textContent = frame.gripped < 0 ? "–" : `${newtons(frame.pull).toFixed(2)} N`;
     const shown = frame.gripped < 0 ? numbers.force.textContent : numbers.pull.textContent;
     this.readout.textContent = shown === "–" ? "" : shown;
-    numbers.penetration.textContent = `${frame.penetration.toFixed(2)} mm`;
+    numbers.indentation.textContent = frame.tool < 0 || !newtons(frame.force) ? "–" : `${frame.indentation.toFixed(1)} mm`;
+    numbers.overlap.textContent = frame.tool < 0 ? "–" : `${frame.penetration.toFixed(2)} mm`;
     numbers.time.textContent = `${frame.time.toFixed(2)} s`;
     numbers.rate.textContent = `${Math.round(frame.stepsPerSecond)} steps/s, ${this.link.framesPerSecond} frames/s`;
     this.plots.write();

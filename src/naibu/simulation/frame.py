@@ -8,7 +8,7 @@ from typing import Any
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.interactive_bodies import InteractiveBody
-from naibu.simulation.tool_places import placed
+from naibu.simulation.tool_places import indentation_depth, placed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,5 +88,15 @@ class Frame:
         """How deep the nodes of the surface lie in the tool at most; found when it is asked for, as most frames of 1 ms are not shown."""
         if self.shape is None:
             return 0.0
-        gaps = placed(self.shape, self.tool_centre, self.tool_rotation).gap(self.positions[self.surface])
+        gaps = self._placed(self.shape).gap(self.positions[self.surface])
         return max(0.0, -float(gaps.min()))
+
+    @property
+    def indentation_mm(self) -> float:
+        """How deep the tool lies below the surface at rest, along its force; see `naibu.simulation.tool_places.indentation_depth`."""
+        if self.shape is None:
+            return 0.0
+        return indentation_depth(self._placed(self.shape), self.force, self.body.points, self.positions, self.body.faces)
+
+    def _placed(self, shape: RigidIndenter) -> RigidIndenter:
+        return placed(shape, self.tool_centre, self.tool_rotation)

@@ -32,6 +32,7 @@ from naibu.meshing.refinement.forest import BisectionForest
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
 from naibu.simulation.cut_sides import caution_of_cuts, outward_normals, with_sides_of_cuts
 from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
+from naibu.simulation.tool_places import surface_samples
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
 AnySession = Session[Any, Any]
@@ -95,6 +96,9 @@ class InteractiveBody(Protocol):
 
     def strain(self, positions: FloatArray) -> FloatArray:
         """Return a scalar strain at the nodes (n,), %, at positions (n, 3), mm."""
+
+    def kept_clear(self, positions: FloatArray) -> FloatArray:
+        """Return points of the body (k, 3), mm, that a tool which waits is clear of, at positions of its nodes (n, 3), mm."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,6 +221,10 @@ class LatticeBody:
         ends = np.concatenate([i, j])
         sums = np.bincount(ends, np.concatenate([stretch, stretch]), minlength=lattice.n_nodes)
         return np.asarray(100.0 * sums / np.maximum(np.bincount(ends, minlength=lattice.n_nodes), 1))
+
+    def kept_clear(self, positions: FloatArray) -> FloatArray:
+        """Return the nodes and the middles of the elements (k, 3), mm: a session refuses indenters that begin about one of them."""
+        return np.concatenate([positions, positions[self.engine.lattice.elements].mean(axis=1)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -420,6 +428,10 @@ class FiniteElementBody:
         equivalent = np.sqrt(2.0 / 3.0 * (deviator**2).sum(axis=(1, 2)))
         sums = np.bincount(self.cells.ravel(), np.repeat(equivalent, 4), minlength=len(self.points))
         return np.asarray(100.0 * sums / np.maximum(np.bincount(self.cells.ravel(), minlength=len(self.points)), 1))
+
+    def kept_clear(self, positions: FloatArray) -> FloatArray:
+        """Return nodes, middles of edges and centroids of the triangles of the surface (k, 3), mm."""
+        return surface_samples(positions, self.faces)
 
 
 def nodes_touching(points: FloatArray, indenters: Sequence[RigidIndenter], tolerance_mm: float = 1e-6) -> IntArray:

@@ -425,8 +425,8 @@ class InteractiveSimulation:
         self._tool_hand.stop()
         self._rotation = self._rotation_target = np.eye(3)
         if tool:
-            positions = self._session.positions(self._surface)
-            self._centre = self._target = waiting_place(self.tools[tool], positions, 0.1 * self.extent_mm)
+            points = self.body.kept_clear(self._session.positions())
+            self._centre = self._target = waiting_place(self.tools[tool], points, 0.1 * self.extent_mm)
         own = [] if not tool else [placed(self.tools[tool], self._centre)]
         self._session.press((*self.body.fixtures, *own))
 

@@ -1,4 +1,4 @@
-"""Where a tool is: a copy of it at another place, where it waits, and the next point on its way after a hand."""
+"""Where a tool is: a copy of it at another place, where it waits, the next point on its way after a hand, and how deep it presses."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 
 THROUGH = 0.5  # of the thinnest half extent of a tool
@@ -51,17 +51,62 @@ def towards(start: FloatArray, target: FloatArray, reach: float) -> FloatArray:
     return np.asarray(target if length <= reach else start + way * (reach / length), dtype=float)
 
 
-def waiting_place(tool: RigidIndenter, positions: FloatArray, step_mm: float) -> FloatArray:
-    """Return where a tool waits (3,), mm: where it was made, raised by steps until it is clear of the surface at positions (n, 3), mm."""
+def waiting_place(tool: RigidIndenter, points: FloatArray, step_mm: float) -> FloatArray:
+    """Return where a tool waits (3,), mm: where it was made, raised by steps until it is clear of points (n, 3), mm, of the body."""
     centre = np.array(tool.centre, dtype=float)
     for _ in range(MOST_RAISED):
-        if placed(tool, centre).gap(positions).min() > 0.0:
-            break
+        if placed(tool, centre).gap(points).min() > 0.0:
+            return centre
         centre[2] += step_mm
-    return centre
+    below = tool.geometry.reach(np.array([0.0, 0.0, -1.0]))
+    return np.array([*centre[:2], float(points[:, 2].max()) + below + step_mm])
 
 
 def farthest_in_a_step(tool: RigidIndenter) -> float:
     """Return how far a tool may move in a step, mm, so that nothing passes through its middle."""
     size = np.asarray(tool.geometry.size)
     return THROUGH * float(size[size > 0.0].min(initial=np.inf))
+
+
+def surface_samples(positions: FloatArray, faces: IntArray) -> FloatArray:
+    """Return corners, middles of edges and centroid of every triangle (7 f, 3), mm.
+
+    Parameters
+    ----------
+    positions : ndarray, shape (n, 3)
+        Of the nodes, mm.
+    faces : ndarray, shape (f, 3), int
+        Triangles.
+    """
+    corners = positions[faces]
+    middles = 0.5 * (corners + np.roll(corners, 1, axis=1))
+    return np.concatenate([corners, middles, corners.mean(axis=1, keepdims=True)], axis=1).reshape(-1, 3)
+
+
+def indentation_depth(tool: RigidIndenter, force: FloatArray, rest: FloatArray, positions: FloatArray, faces: IntArray) -> float:
+    """Return how deep a tool lies below the surface at rest, along its force, mm; 0 without force.
+
+    A sample that was moved by m along the force, and is now g away from the tool (negative inside), says that the tool has come m - g deep:
+    exactly where it lies ahead of the tool, and less elsewhere. The largest counts: the displacement that an indentation test plots.
+
+    Parameters
+    ----------
+    tool : RigidIndenter
+        Where it is.
+    force : ndarray, shape (3,)
+        Of the tool on the body, mN.
+    rest, positions : ndarray, shape (n, 3)
+        Of the nodes at rest and now, mm.
+    faces : ndarray, shape (f, 3), int
+        Triangles of the surface.
+    """
+    size = float(np.linalg.norm(force))
+    if size == 0.0 or not len(faces):
+        return 0.0
+    nodes, corners = np.unique(faces, return_inverse=True)
+    moved = positions[nodes]
+    deep = ((moved - rest[nodes]) @ force / size - tool.gap(moved))[corners.reshape(faces.shape)].max(axis=1)
+    sides = positions[faces] - np.roll(positions[faces], 1, axis=1)
+    near = faces[deep + 2.0 * np.sqrt((sides**2).sum(axis=2).max(axis=1)) >= deep.max()]  # others cannot have a deeper sample
+    now = surface_samples(positions, near)
+    return max(0.0, float(((now - surface_samples(rest, near)) @ force / size - tool.gap(now)).max()))

@@ -47,7 +47,7 @@ class Source:
     def frame(self) -> LiveFrame:
         self.shown = self.number
         centre, force = np.arange(3.0), np.array([0, 0, -5.0])
-        return LiveFrame(self.shown, 0.5, POINTS + 1.0, 0, -1, centre, force, np.zeros(3), 0.25, 60.0, 1.0, 0, lambda: np.arange(4.0))
+        return LiveFrame(self.shown, 0.5, POINTS + 1.0, 0, -1, centre, force, np.zeros(3), 0.25, 3.5, 60.0, 1.0, 0, lambda: np.arange(4.0))
 
     def command(self, command: LiveCommand) -> None:
         self.told.append(command)
@@ -120,10 +120,11 @@ def test_a_frame_holds_what_the_simulation_says(running: Running) -> None:
         data = link.recv(timeout=20)
     assert isinstance(data, bytes)
     header = np.frombuffer(data[: HEADER.itemsize], HEADER)[0]
-    assert header["magic"] == b"NLV4"
+    assert header["magic"] == b"NLV5"
     assert header["nodes"] == 4
     assert header["flags"] & DRIVING
     assert header["force"].tolist() == [0.0, 0.0, -5.0]
+    assert (header["penetration"], header["indentation"], header["steps_per_s"]) == (0.25, 3.5, 60.0)
     values = np.frombuffer(data[HEADER.itemsize :], "<f4")
     np.testing.assert_array_equal(values[:12].reshape(4, 3), POINTS + 1.0)
     np.testing.assert_array_equal(values[12:], np.arange(4.0))

@@ -39,6 +39,7 @@ def test_a_person_pushes_pulls_looks_inside_and_saves(tmp_path: Path) -> None:
         page.value("naibuLive.command('move', {at: [20, 20, 43]})")
         page.wait(f"{frame}.force[2] < -1", 60)
         assert page.value("naibuLive.numbers.force.textContent").endswith(" N")
+        page.wait("Math.abs(parseFloat(naibuLive.numbers.indentation.textContent) - 2.6) < 0.15", 30)  # a sphere of radius 5.6, top at 40
         page.value("naibuLive.view.setClip(1, 0.5)")
         assert page.value("naibuLive.view.cap.geometry.attributes.position.count") > 50
         page.value("naibuLive.command('colour', {name: 'strain'}, true)")

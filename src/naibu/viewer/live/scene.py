@@ -13,7 +13,7 @@ from naibu.viewer.live.closed_surface import is_closed
 from naibu.viewer.live.cut_outline import cut_outline
 from naibu.viewer.motion_page import RigidShape
 
-MAGIC = b"NLV4"
+MAGIC = b"NLV5"
 HEADER = np.dtype(
     [
         ("magic", "S4"),
@@ -29,6 +29,7 @@ HEADER = np.dtype(
         ("pull", "<f4", 3),
         ("centre", "<f4", 3),
         ("penetration", "<f4"),
+        ("indentation", "<f4"),
         ("steps_per_s", "<f4"),
         ("real_time", "<f4"),
         ("unbalanced", "<f4"),
@@ -171,8 +172,10 @@ class LiveFrame:
         Position of the tool, mm.
     force, pull : ndarray, shape (3,)
         Of the tool and of the grip on the body, mN.
-    penetration_mm, steps_per_s, real_time : float
-        How deep the surface lies in the tool; steps a second; simulated seconds a second.
+    penetration_mm, indentation_mm : float
+        How deep the surface lies in the tool; how deep the tool lies below it where it is at rest.
+    steps_per_s, real_time : float
+        Steps a second; simulated seconds a second.
     flags : int
         Sum of `PAUSED`, `RECORDING`, `REPLAYING`, `FAILED`, `HELD` (the tool is held back), `UNDER_WAY` (a step takes longer than a frame),
         `PREPARING` (kernels of cuts are being compiled: none can be made yet).
@@ -199,6 +202,7 @@ class LiveFrame:
     force: FloatArray
     pull: FloatArray
     penetration_mm: float
+    indentation_mm: float
     steps_per_s: float
     real_time: float
     flags: int
@@ -218,6 +222,7 @@ def frame_bytes(frame: LiveFrame, driving: bool, values: FloatArray | None = Non
         ("tool", frame.tool), ("gripped", frame.gripped), ("valued", int(values is not None)),
         ("topology", frame.topology), ("time_s", frame.time_s),
         ("force", frame.force), ("pull", frame.pull), ("centre", frame.centre), ("penetration", frame.penetration_mm),
+        ("indentation", frame.indentation_mm),
         ("steps_per_s", frame.steps_per_s), ("real_time", frame.real_time), ("unbalanced", frame.unbalanced),
         ("rotation", frame.rotation), ("readings", len(frame.readings)), ("cut_stage", frame.cut_stage),
     ):  # fmt: skip

@@ -89,7 +89,7 @@ class LiveSimulation:
         tool = list(self.loop.simulation.tools).index(frame.tool) if frame.tool else -1
         return LiveFrame(
             frame.number, frame.time_s, frame.positions, tool, frame.gripped, frame.tool_centre, frame.force, frame.pull,
-            frame.penetration_mm, pace.steps_per_s, pace.real_time, flags,
+            frame.penetration_mm, frame.indentation_mm, pace.steps_per_s, pace.real_time, flags,
             lambda: frame.body.strain(frame.positions), frame.topology, frame.unbalanced,
             tuple(Rotation.from_matrix(frame.tool_rotation).as_quat().tolist()), pace.cut_stage,
             np.zeros((0, 3)) if self.model.sensor is None else self.model.sensor.at(frame),
