@@ -16,9 +16,11 @@ from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, first_point, search
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph
+from naibu.identification.from_fields.regions import segmentation
 from naibu.identification.from_fields.regions.border_refinement import RefinedRegions, on_finer_cells, refined_borders, refined_regions
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
-from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined, merged
+from naibu.identification.from_fields.regions.merging import merged
+from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined, segment, weight_of_borders
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
@@ -160,6 +162,22 @@ def test_lumps_are_of_one_material_where_the_data_do_not_tell_their_moduli_apart
         np.testing.assert_array_equal(found.apart != 0.0, joined_moduli)
     else:
         assert not found.apart.any()
+
+
+def test_a_soft_lump_of_which_the_map_shows_the_core_is_found_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The core alone fits best nearly empty, and about that a quadratic approximation joins it with all that is around it."""
+    monkeypatch.setattr(segmentation, "CLUSTERS", (8,))
+    fields, _ = model()
+    middles = fields.mesh.points[fields.mesh.cells].mean(axis=1)[fields.zones.of_cell >= 0]
+    lump = (np.abs(middles - [0.0, 0.0, 20.0]).max(axis=1) < 4.0).astype(np.int64)
+    truth = logarithms(*np.array([lame_parameters(e, 0.45) for e in (5.0, 1.0)]).T)
+    again, start = _measured(fields, np.concatenate([truth[:2][lump], truth[2:][lump]]), seed=5)
+    core = np.isin(np.arange(len(lump)), np.flatnonzero(lump)[:4])
+    seen = again.evaluate(np.concatenate([truth[0] - 0.7 * core, np.full(len(lump), truth[2])]), start.states)
+    graph = ZoneGraph.of(fields.mesh, fields.zones)
+    found = segment(again, graph, seen, weight_of_borders(graph), Bounds())
+    np.testing.assert_array_equal(found.of_zone, lump)
+    assert young_and_poisson(found.point.theta)[0] == pytest.approx([5.0, 1.0], rel=0.2)
 
 
 def _two_lumps(*radii_mm: float) -> tuple[FieldModel, np.ndarray]:

@@ -11,14 +11,13 @@ from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, logarithms, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, first_point
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph
+from naibu.identification.from_fields.regions.merging import CLEAR, merged
 from naibu.identification.from_fields.regions.segmentation import (
-    CLEAR,
     Criterion,
     areas_between,
     border_moves,
     clusters,
     joined,
-    merged,
     segment,
 )
 from naibu.meshing.primitives import box
@@ -140,7 +139,9 @@ def test_the_criterion_counts_borders_and_regions() -> None:
     theta = point.theta.reshape(2, -1)[:, [0, -1]].ravel()
     cost = criterion.value(layer, regions.evaluate(theta, point.states))
     scale = max(1.0, point.misfit / model.n_free)
-    expected = 0.5 * point.misfit / scale + 0.05 / scale * 1600.0 * CLEAR + 2.0 * (np.log(model.n_free) + np.log(192))
+    contrasts = 0.5 * float((np.diff(theta.reshape(2, -1)) ** 2).sum())  # over a variance of 1
+    charges = 2.0 * (np.log(model.n_free) + np.log(192))
+    expected = 0.5 * point.misfit / scale + 0.05 / scale * 1600.0 * CLEAR + contrasts + charges
     assert cost == pytest.approx(expected, rel=1e-6)
 
 

@@ -29,6 +29,7 @@ from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Obje
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph, cell_volumes
 from naibu.identification.from_fields.mesh_error import DOUBT, DOUBT_OF_RATIO, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
+from naibu.identification.from_fields.regions.contrast_prior import moderated
 from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined
 
 MOST_REGIONS, CANDIDATES = 6, 3  # whose borders are refined; pairs that are tried as one
@@ -213,6 +214,7 @@ def refined_borders(model: FieldModel, zones: Zones, start: Point, bounds: Bound
         The data do not determine moduli and borders together.
     """
     cells = Borders.of(model.mesh, zones, pieces)
+    start = replace(start, theta=moderated(start.theta, 0))
     starts = [cells] + [ball for ball in [cells.rounded()] if ball.round.any()]
     ends: list[tuple[Mixing, _Trial]] = []
     for last, borders in enumerate(starts, 1 - len(starts)):

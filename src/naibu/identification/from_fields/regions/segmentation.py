@@ -26,16 +26,16 @@ from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOL
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Point
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Found, Objective, SearchSettings, first_point, search
 from naibu.identification.from_fields.inversion.regularization import BULK_WEIGHT, ZoneGraph
+from naibu.identification.from_fields.regions.contrast_prior import ContrastPrior, moderated
+from naibu.identification.from_fields.regions.merging import CLEAR, jump_costs, merged
 
 CLUSTERS = (20, 8)  # to begin with, one after the other: the better end counts
 LIKE = 0.005  # difference of logarithms of moduli between neighbours that belong together at once
-CLEAR = 0.25  # jump of logarithms beyond which a border counts no more when regions are merged: noise and errors of models seldom make such
 # half of chi squared that a face of a border costs: the number of closed surfaces of n faces on a cubic lattice grows about as 1.7^n
 FACE = 0.55
-PRIOR_SD = 1.0  # of the logarithms about the clusters' means while merging: of what the data do not determine
-ROUNDS = 8
+ROUNDS, PAIRS = 12, 3  # of merging and fitting; pairs that are tried where the fit does not confirm a merger
 ROUGHLY = SearchSettings(max_iterations=12, tolerance=1e-5)  # while the regions may still change
-EXPLICIT = 500  # zones up to which cells at borders may change sides: it takes the whole Hessian
+EXPLICIT = 500  # zones up to which a map is searched with the whole Hessian, and that may change sides between regions
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,63 +143,6 @@ def _ward(pairs: IntArray, means: FloatArray, volume: FloatArray, most: int) -> 
     return np.unique(owner, return_inverse=True)[1].astype(np.int64)
 
 
-def merged(
-    quadratic: Concentrated, theta: FloatArray, area: FloatArray, weight: float, charge: float, most: int | None = None
-) -> tuple[IntArray, FloatArray]:
-    """Merge clusters while that lowers the objective, all other moduli adapting at once.
-
-    Parameters
-    ----------
-    quadratic : Concentrated
-        Half of chi squared about `theta`.
-    theta : ndarray, shape (2 k,)
-        Logarithms of the clusters' moduli there.
-    area : ndarray, shape (k, k)
-        Of the faces between clusters, mm^2.
-    weight : float
-        Of total variation, 1/mm^2.
-    charge : float
-        What a region costs.
-    most : int, optional
-        How many pairs are merged at most.
-
-    Returns
-    -------
-    labels : ndarray, shape (k,), int64
-        Region of every cluster.
-    theta : ndarray, shape (2 regions,)
-        Logarithms of the regions' moduli.
-    """
-    k = len(theta) // 2
-    hessian = quadratic.hessian + np.eye(2 * k) / PRIOR_SD**2
-    right = hessian @ theta - quadratic.gradient
-    gather = np.eye(k)
-    while True:
-        both = np.kron(np.eye(2), gather)
-        covariance = np.linalg.inv(both.T @ hessian @ both)
-        best = covariance @ (both.T @ right)
-        gains = _gains_of_merging(best, covariance, gather.T @ area @ gather, weight) + charge
-        if gains.size == 1 or not gains.max() > 0.0 or k - len(gather.T) == most:
-            return gather.argmax(axis=1).astype(np.int64), best
-        i, j = sorted(np.unravel_index(int(np.argmax(gains)), gains.shape))
-        gather[:, i] += gather[:, j]
-        gather = np.delete(gather, j, axis=1)
-
-
-def _gains_of_merging(theta: FloatArray, covariance: FloatArray, area: FloatArray, weight: float) -> FloatArray:
-    """Return by how much the objective falls when two regions become one (r, r); minus infinity on the diagonal."""
-    r = len(area)
-    jump = theta.reshape(2, r)[:, :, None] - theta.reshape(2, r)[:, None, :]
-    blocks = covariance.reshape(2, r, 2, r).transpose(1, 3, 0, 2)  # (r, r, 2, 2)
-    own = blocks[np.arange(r), np.arange(r)]
-    of_jump = own[:, None] + own[None, :] - blocks - np.swapaxes(blocks, 2, 3)
-    of_jump[np.arange(r), np.arange(r)] = np.eye(2)
-    loss = 0.5 * np.einsum("aij,ijab,bij->ij", jump, np.linalg.inv(of_jump), jump)
-    gains = weight * area * jump_costs(jump) - loss
-    gains[np.arange(r), np.arange(r)] = -np.inf
-    return np.asarray(gains)
-
-
 def areas_between(graph: ZoneGraph, labels: IntArray) -> FloatArray:
     """Return the area of the faces between regions (k, k), mm^2."""
     k = int(labels.max()) + 1
@@ -210,7 +153,9 @@ def areas_between(graph: ZoneGraph, labels: IntArray) -> FloatArray:
     return out
 
 
-def border_moves(graph: ZoneGraph, labels: IntArray, theta: FloatArray, quadratic: Concentrated, weight: float) -> tuple[IntArray, int]:
+def border_moves(
+    graph: ZoneGraph, labels: IntArray, theta: FloatArray, quadratic: Concentrated, weight: float, movable: IntArray | None = None
+) -> tuple[IntArray, int]:
     """Let zones at borders change sides, one at a time, the one that lowers the objective most first.
 
     Parameters
@@ -222,9 +167,11 @@ def border_moves(graph: ZoneGraph, labels: IntArray, theta: FloatArray, quadrati
     theta : ndarray, shape (2 regions,)
         Logarithms of the regions' moduli, which stay.
     quadratic : Concentrated
-        Half of chi squared in the logarithms of all zones, about these moduli.
+        Half of chi squared in the logarithms of the movable zones, about these moduli.
     weight : float
         Of total variation, 1/mm^2.
+    movable : ndarray, shape (m,), int64, optional
+        Zones that may change sides; by default all.
 
     Returns
     -------
@@ -233,26 +180,27 @@ def border_moves(graph: ZoneGraph, labels: IntArray, theta: FloatArray, quadrati
     moves : int
         How many changed.
     """
-    n, labels = graph.count, labels.copy()
-    values = theta.reshape(2, -1)
+    labels, movable = labels.copy(), np.arange(graph.count) if movable is None else movable
+    values, m = theta.reshape(2, -1), len(movable)
     jumps = np.hypot(values[0][:, None] - values[0], BULK_WEIGHT * (values[1][:, None] - values[1]))
-    hessian = quadratic.hessian.reshape(2, n, 2, n)
-    own = hessian[:, np.arange(n), :, np.arange(n)]  # (n, 2, 2)
-    gradient = quadratic.gradient.reshape(2, n).copy()
-    half = sp.csr_matrix((graph.area, tuple(graph.pairs.T)), shape=(n, n))
-    touching = (half + half.T).tocsr()
-    for moves in range(4 * n):
-        step = values[:, None, :] - values[:, labels][:, :, None]  # (2, n, regions)
+    hessian = quadratic.hessian.reshape(2, m, 2, m)
+    own = hessian[:, np.arange(m), :, np.arange(m)]  # (m, 2, 2)
+    gradient = quadratic.gradient.reshape(2, m).copy()
+    half = sp.csr_matrix((graph.area, tuple(graph.pairs.T)), shape=(graph.count, graph.count))
+    touching = (half + half.T).tocsr()[movable]
+    for moves in range(4 * m):
+        of_movable = labels[movable]
+        step = values[:, None, :] - values[:, of_movable][:, :, None]  # (2, m, regions)
         of_data = np.einsum("in,inr->nr", gradient, step) + 0.5 * np.einsum("inr,nij,jnr->nr", step, own, step)
         beside = touching @ np.eye(values.shape[1])[labels]  # area that every zone shares with every region
-        of_borders = beside @ jumps.T - np.take_along_axis(beside @ jumps.T, labels[:, None], axis=1)
+        of_borders = beside @ jumps.T - np.take_along_axis(beside @ jumps.T, of_movable[:, None], axis=1)
         change = np.where(beside > 0.0, of_data + weight * of_borders, 0.0)
         zone, region = np.unravel_index(int(np.argmin(change)), change.shape)
         if not change[zone, region] < -1e-6:
             return labels, moves
         gradient += np.einsum("inj,j->in", hessian[:, :, :, zone], step[:, zone, region])
-        labels[zone] = region
-    return labels, 4 * n
+        labels[movable[zone]] = region
+    return labels, 4 * m
 
 
 def segment(
@@ -337,62 +285,60 @@ class Criterion:
         area = areas_between(self.graph, labels)
         values = point.theta.reshape(2, -1)
         borders = float(np.sum(area * jump_costs(values[:, :, None] - values[:, None, :]))) / 2.0
-        return float(0.5 * point.misfit / self.scale + self.weight * borders + self.charge * len(area))
+        contrasts = self.prior(labels).value(point.theta)
+        return float(0.5 * point.misfit / self.scale + self.weight * borders + contrasts + self.charge * len(area))
 
-
-def jump_costs(jump: FloatArray) -> FloatArray:
-    """Return what jumps (2, ...) of the logarithms cost an area: their length, up to that of a clear one."""
-    return np.asarray(np.minimum(np.hypot(jump[0], BULK_WEIGHT * jump[1]), CLEAR))
+    def prior(self, labels: IntArray) -> ContrastPrior:
+        """Return the prior of the moduli of regions."""
+        return ContrastPrior(int(np.argmax(np.bincount(labels, self.graph.volume))))
 
 
 def _from_clusters(
     model: FieldModel, criterion: Criterion, start: Point, bounds: Bounds, most: int, progress: Progress | None
 ) -> tuple[IntArray, Point, int]:
-    """Merge clusters, fit regions and mend their borders until nothing changes; returns regions, their fit, and how many zones moved.
-
-    Merging goes by a quadratic approximation, which says nothing far away: that of a lump of too few cells, nearly empty, knows no
-    stiffer one. What it merged counts only if the fit confirms it, first all of it, then a pair at a time.
-    """
+    """Merge clusters, fit regions and mend their borders until nothing changes; returns regions, their fit, and how many zones moved."""
     graph = criterion.graph
     labels = clusters(graph, start.theta, most)
     volume = np.bincount(labels, graph.volume)
     theta = np.concatenate([np.bincount(labels, graph.volume * t) / volume for t in start.theta.reshape(2, -1)])
     point, moved, near = _at(model.with_zones(joined(model.zones, labels)), theta, start), 0, None
-    best = np.inf
     for _ in range(ROUNDS):
-        quadratic = model.with_zones(joined(model.zones, labels)).linearised(point).concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE, near)
-        end = _lowered(model, criterion, (labels, point, quadratic), best, bounds, progress)
+        fitted = model.with_zones(joined(model.zones, labels))
+        quadratic = fitted.linearised(point).concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE, near)
+        before, changed = int(labels.max()), 0
+        end = _with_less(model, criterion, (labels, point, quadratic), bounds, progress)
         if end is None:
             break
-        before, changed = int(labels.max()), 0
         labels, found = end
         point, near = found.point, found.response
-        if graph.count <= EXPLICIT and int(labels.max()) > 0:
+        if int(labels.max()) > 0:
             labels, point, changed = _with_better_borders(model, criterion, labels, point, bounds, progress)
             near = None if changed else near
-        moved, best = moved + changed, criterion.value(labels, point)
+        moved += changed
         if not changed and before == int(labels.max()):
             break
     return labels, point, moved
 
 
-def _lowered(
-    model: FieldModel,
-    criterion: Criterion,
-    here: tuple[IntArray, Point, Concentrated],
-    below: float,
-    bounds: Bounds,
-    progress: Progress | None,
+def _with_less(
+    model: FieldModel, criterion: Criterion, here: tuple[IntArray, Point, Concentrated], bounds: Bounds, progress: Progress | None
 ) -> tuple[IntArray, Found] | None:
-    """Return merged regions with a fit that costs less than `below`, or whatever it costs if nothing was merged; None if there are none."""
+    """Return regions of which up to half were merged, and their fit; None where all that was tried costs more than before.
+
+    Merging goes by a quadratic approximation, which says nothing far away: that about a lump of too few cells, nearly empty, knows of no
+    stiffer one. It counts only if the fit confirms it; otherwise pairs are tried, one at a time.
+    """
     labels, point, quadratic = here
     scaled, area = _scaled(quadratic, criterion.scale), areas_between(criterion.graph, labels)
-    for most in (len(area), 1):
-        united, theta = merged(scaled, point.theta, area, criterion.weight, criterion.charge, most)
+    below, apart = criterion.value(labels, point), np.zeros(area.shape, dtype=bool)
+    for most in (max(1, len(area) // 2), *[1] * PAIRS):
+        united, theta = merged(scaled, point.theta, area, criterion.weight, criterion.charge, most, apart)
         gather = np.kron(np.eye(2), np.eye(int(united.max()) + 1)[united])
-        new, found = _refitted(model, united[labels], theta, point, bounds, progress, [x @ gather for x in quadratic.response])
+        new, found = _refitted(model, criterion, united[labels], theta, point, bounds, progress, [x @ gather for x in quadratic.response])
         if int(united.max()) + 1 == len(area) or criterion.value(new, found.point) < below:
             return new, found
+        if most == 1:
+            apart |= united[:, None] == united
     return None
 
 
@@ -414,6 +360,7 @@ def _scaled(quadratic: Concentrated, scale: float) -> Concentrated:
 
 def _refitted(
     model: FieldModel,
+    criterion: Criterion,
     labels: IntArray,
     theta: FloatArray,
     near: Point,
@@ -421,12 +368,12 @@ def _refitted(
     progress: Progress | None,
     response: list[FloatArray] | None = None,
 ) -> tuple[IntArray, Found]:
-    """Fit the moduli of regions to the measurements alone; regions that have no zone any more are left out."""
+    """Fit the moduli of regions to the measurements and the prior of contrasts; regions that have no zone any more are left out."""
     kept, labels = np.unique(labels, return_inverse=True)
     of_kept = np.concatenate([kept, kept + len(theta) // 2])
     response = None if response is None else [x[:, of_kept] for x in response]
     regions = model.with_zones(joined(model.zones, labels))
-    objective = Objective(bounds=bounds)
+    objective = Objective(criterion.prior(labels), criterion.scale, bounds)
     start = _at(regions, objective.clipped(theta.reshape(2, -1)[:, kept].ravel()), near)
     return labels.astype(np.int64), search(regions, start, objective, ROUGHLY, near=response, progress=progress)
 
@@ -434,10 +381,21 @@ def _refitted(
 def _with_better_borders(
     model: FieldModel, criterion: Criterion, labels: IntArray, point: Point, bounds: Bounds, progress: Progress | None
 ) -> tuple[IntArray, Point, int]:
-    everywhere = _at(model, point.theta.reshape(2, -1)[:, labels].ravel(), point)
-    quadratic = _scaled(model.linearised(everywhere).concentrated(np.eye(2 * criterion.graph.count), ROUGH_TOLERANCE), criterion.scale)
-    found, moves = border_moves(criterion.graph, labels, point.theta, quadratic, criterion.weight)
+    """Let zones change sides, in larger maps those at borders, if the fit confirms it; returns regions, fit, and how many did."""
+    graph = criterion.graph
+    movable = np.arange(graph.count)
+    if graph.count > EXPLICIT:
+        movable = np.unique(graph.pairs[labels[graph.pairs[:, 0]] != labels[graph.pairs[:, 1]]])
+    if len(movable) > EXPLICIT:
+        return labels, point, 0
+    theta = moderated(point.theta, criterion.prior(labels).largest)
+    everywhere = _at(model, theta.reshape(2, -1)[:, labels].ravel(), point)
+    slopes = np.kron(np.eye(2), np.eye(graph.count)[:, movable])
+    quadratic = _scaled(model.linearised(everywhere).concentrated(slopes, ROUGH_TOLERANCE), criterion.scale)
+    found, moves = border_moves(graph, labels, theta, quadratic, criterion.weight, movable)
     if not moves:
         return labels, point, 0
-    labels, refitted = _refitted(model, found, point.theta, point, bounds, progress)
-    return labels, refitted.point, moves
+    new, refitted = _refitted(model, criterion, found, theta, point, bounds, progress)
+    if not criterion.value(new, refitted.point) < criterion.value(labels, point):  # the approximation says nothing far away
+        return labels, point, 0
+    return new, refitted.point, moves
