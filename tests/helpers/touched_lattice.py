@@ -12,9 +12,9 @@ SPACING = 10.0
 TOP = 40.0
 
 
-def touched_lattice() -> LatticeBody:
-    """Return a cube of 40 mm that stands on z = 0, where it is held."""
-    lattice = classic_lattice(box_mask((4, 4, 4)), SPACING, total_mass_kg=0.064)
+def touched_lattice(cubes: int = 4, spacing_mm: float = SPACING) -> LatticeBody:
+    """Return a cube, of 40 mm by default, that stands on z = 0, where it is held."""
+    lattice = classic_lattice(box_mask((cubes,) * 3), spacing_mm, total_mass_kg=1e-6 * (cubes * spacing_mm) ** 3)
     parameters = lattice_parameters(
         lattice,
         {"short": 60.0, "normal": 40.0, "long": 25.0},

@@ -31,6 +31,11 @@ def small_lattice() -> TouchableModel:
     return TouchableModel("Lattice", (), touched_lattice(), "mean elongation, %")
 
 
+def large_lattice() -> TouchableModel:
+    """Return a cube of 17^3 nodes that is held at its lowest ones."""
+    return TouchableModel("Lattice", (), touched_lattice(16, 5.0), "mean elongation, %")
+
+
 def small_gel() -> TouchableModel:
     """Return a nearly incompressible block of tetrahedra on a table, under its weight."""
     mesh = to_tetra(box((40.0, 40.0, 40.0), (4, 4, 4)))
@@ -64,5 +69,6 @@ MODELS: dict[str, Callable[[], TouchableModel]] = {
     "demo-threads": lambda: touchable("demo"),
     "dough": lambda: touchable("dough-pressed-by-sphere"),
     "dough-held": lambda: touchable("dough-first-pushing"),
+    "cube": large_lattice,
     "octree": lambda: touchable("cube-pushing-octree-1"),
 }

@@ -25,6 +25,7 @@ from naibu.viewer.live.commands import read_command  # noqa: E402
 from naibu.viewer.live.scene import frame_bytes  # noqa: E402
 from naibu.workflows import TouchableModel, tools_for  # noqa: E402
 from naibu.workflows.interactive.live import BUDGET_S, DELAY_S, LiveSimulation  # noqa: E402
+from naibu.workflows.interactive.touchable_models import touchable  # noqa: E402
 
 MOST_DISPLACED = 6.0  # extents of the body; further only pieces that nothing holds
 MOST_KEPT = 20
@@ -214,10 +215,10 @@ def driven(
 
 def main() -> int:
     """Drive models, and print what must not have happened."""
-    from touched_models import MODELS
+    from touched_models import MODELS, repeatable
 
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("model", choices=MODELS)
+    parser.add_argument("model", help=f"{', '.join(MODELS)}, or what naibu live takes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=5)
     parser.add_argument("--frames", type=int, default=300)
@@ -228,10 +229,9 @@ def main() -> int:
     bad = 0
     for seed in range(given.seed, given.seed + given.count):
         began = time.process_time()
+        model = MODELS[given.model]() if given.model in MODELS else repeatable(touchable(given.model))
         try:
-            page = driven(
-                MODELS[given.model](), seed, given.frames, cuts=not given.no_cuts, as_live=given.as_live, settling_s=given.settling
-            )
+            page = driven(model, seed, given.frames, cuts=not given.no_cuts, as_live=given.as_live, settling_s=given.settling)
         except Exception:
             traceback.print_exc()
             bad += 1

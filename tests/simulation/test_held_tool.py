@@ -17,7 +17,7 @@ from naibu.simulation import FiniteElementBody, InteractiveBody, InteractiveSimu
 from naibu.simulation.crushed_cells import CrushedCells
 from naibu.simulation.held_tool import CRUSHED, outside_planes
 from naibu.simulation.tool_places import placed
-from naibu.workflows import tools_for
+from naibu.workflows import tools_for, touchable
 
 TURNED = rotation_matrix(np.array([0.4, -0.9, 0.3]))
 
@@ -178,3 +178,21 @@ def test_where_steps_are_shown_one_by_one_a_press_is_held_as_well() -> None:
     cells = CrushedCells.of(body.points, body.cells)
     assert 0.5 * CRUSHED - 0.1 < cells.least_stretch(touched.last.positions, 0)[0] < 0.3
     assert touched.last.tool_centre[2] > 0.3 * TOP
+
+
+def test_the_force_does_not_leap_while_crushed_cells_hold_a_tool_back() -> None:
+    """Steps of 1 ms, as a haptic device feels them: braked anew at each look at the cells, the tool's force had leapt by 1.5 N in one."""
+    body = touchable("dough-pressed-by-sphere").body
+    tool = tools_for(body)["sphere"]
+    touched = InteractiveSimulation(body, {"sphere": tool}, body.step_s)
+    touched.take("sphere")
+    forces, held = [], []
+    for step in range(450):
+        touched.move(tool.centre - (0.0, 0.0, 0.1 * step))
+        frame = touched.advance()
+        forces.append(np.linalg.norm(frame.force))
+        held.append(frame.held)
+    touched.close()
+    braked = np.array(forces[150:])
+    assert braked.max() > 10_000.0 and any(held[150:]) and held[-1]
+    assert np.abs(np.diff(braked)).max() < 300.0

@@ -383,7 +383,7 @@ class InteractiveSimulation:
                 turned = placed(tool, centre, rotation_matrix(duration * spin) @ self._rotation)
                 centre = outside_planes(self.body.fixtures, turned, centre)
             centre = towards(self._centre, centre, min(reach, farthest_in_a_step(tool) * self.steps))
-            centre = self._centre + self._held.limited(self._centre, centre - self._centre, self._last.force)
+            centre = self._centre + self._held.limited(self._centre, centre - self._centre)
         return centre, spin, towards(gripped, pulled, reach) - gripped
 
     def close(self) -> None:
