@@ -1,7 +1,7 @@
 from .equilibrium_gap.batch import EquilibriumGapEstimate, batch_equilibrium_gap
 from .equilibrium_gap.incremental import IncrementalEstimate, incremental_equilibrium_gap
 from .equilibrium_gap.weighted import weighted_equilibrium_gap
-from .from_fields.assumptions import Assumption, MovedBorder
+from .from_fields.assumptions.other_assumptions import Assumption, MovedBorder
 from .from_fields.estimate import identify_field
 from .from_fields.experiment_design import Accuracy, expected_accuracy
 from .from_fields.field_estimate import FieldEstimate

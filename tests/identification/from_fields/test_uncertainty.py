@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.assumptions import Assumption, effects
+from naibu.identification.from_fields.assumptions.other_assumptions import Assumption, effects
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, logarithms, young_and_poisson

@@ -21,7 +21,8 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
-from naibu.identification.from_fields.assumptions import MovedBorder, assumptions, covariance_of, hangs_on_law
+from naibu.identification.from_fields.assumptions import assumed_law
+from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
@@ -225,7 +226,7 @@ class _Recipe:
         resolved = resolution(at, objective, explicit=self._explicit())
         estimate = self._under_penalty(found, choice, resolved)
         if name != "total_variation" or not segmented:
-            return estimate
+            return self._as_map(estimate)
         natural = weight_of_borders(graph)
         if weight == "discrepancy" and choice.met and choice.taken.weight > natural:  # regions are judged by probability: noise makes none
             objective = Objective(penalty, natural, self.bounds)
@@ -237,7 +238,7 @@ class _Recipe:
             regions = segment(self.model, graph, at.point, choice.taken.weight, self.bounds, self.progress)
         except ConvergenceError as error:
             self.record(f"with regions of one material each no equilibrium was found ({error}): the regularised field is the result")
-            return replace(estimate, steps=tuple(self.steps), identifiability=(NO_REGIONS, *estimate.identifiability))
+            return self._as_map(estimate, NO_REGIONS)
         return self._with_regions(estimate, regions, graph)
 
     def _rule(self) -> StepRule:
@@ -287,6 +288,11 @@ class _Recipe:
             young_and_poisson(point.theta), resolved, None, found.status, tuple(self.steps), words,
         )  # fmt: skip
 
+    def _as_map(self, field: FieldEstimate, *first: str) -> FieldEstimate:
+        """Return the field under the penalty as the result, with sentences that come `first`."""
+        words = assumed_law.warned(assumed_law.largest_strain(self.model, field.states), (*first, *field.identifiability))
+        return replace(field, steps=tuple(self.steps), identifiability=words)
+
     def _with_regions(self, field: FieldEstimate, regions: Segmentation, graph: ZoneGraph) -> FieldEstimate:
         """Return the regions as the result if they explain the measurements, else the field under the penalty."""
         target = self.model.n_free
@@ -297,8 +303,7 @@ class _Recipe:
         )
         if misfit > limit:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
-            words = (NO_REGIONS, *field.identifiability)
-            return replace(field, segmentation=regions, steps=tuple(self.steps), identifiability=words)
+            return replace(self._as_map(field, NO_REGIONS), segmentation=regions)
         sharp = self._with_borders(regions, graph)
         return replace(
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
@@ -384,12 +389,13 @@ class _Recipe:
             of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders)).with_added(refined.apart)
         on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
         of_known = covariance_of(others := assumptions(at, quadratic, self.law, stretch, self.borders), len(theta))
+        free, law = assumed_law.with_law_free(at, None if shift is None else residuals, freedom, stretch)
         judged, names = with_enough_points(verdict(model.observed, residuals, freedom), model), model.zones.names
         thin = () if self.region_at is None or corrected is not None else one_cell_thick(model.mesh)
         if self.region_at is not None and shift is not None:
             half = HalfSize(point.theta, theta, on_mesh, beyond_noise=(point.misfit - freedom, misfit - freedom))
             judged = judged_within_cells(judged, names, half, np.isin(names, thin))
-        of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known), False
+        of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known).with_law(law), False
         if shift is not None:
             sure = on_mesh.standard_deviations() < DETERMINED
             if corrected is None:
@@ -406,15 +412,15 @@ class _Recipe:
         total = total.with_added(np.outer(LEFT * taken, LEFT * taken)).with_added(np.diag(self.bounds.doubt_at(theta) ** 2 + unsaid**2))
         theta = np.where(self.bounds.doubt_at(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
         by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
-        bounds = intervals(theta, total)[0]
-        judged = with_limits(judged, names, by_elements, bounds, model.zones.unit, of_law=hangs_on_law(others, theta, bounds))
+        judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total)
+        judged = with_limits(judged, names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
         budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
         limits = (*told_of_elements(coarse, thin), *(FEW_POINTS,) * (not tells_poisson(model)))
         words = statement(judged, model.zones, theta, total, others, limits=limits, budget=budget)
-        borders, parts = (None, None) if refined is None else (refined.borders, refined.parts)
         return FieldEstimate(
             model.mesh, model.zones, theta, tuple(u[: model.mesh.n_points] for u in point.states), misfit, freedom, total, None, None, None,
-            None, status, tuple(self.steps), words, judged, budget, shift, others, borders, parts, taken,
+            None, status, tuple(self.steps), words, judged, budget, shift, others,
+            None if refined is None else refined.borders, None if refined is None else refined.parts, taken, free,
         )  # fmt: skip
 
     def _size(

@@ -10,7 +10,8 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.status import Status
-from naibu.identification.from_fields.assumptions import Assumption
+from naibu.identification.from_fields.assumptions.free_law import FreeLaw
+from naibu.identification.from_fields.assumptions.other_assumptions import Assumption
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import moduli_of, young_and_poisson
 from naibu.identification.from_fields.inversion.regularization_weight import WeightChoice
@@ -67,6 +68,8 @@ class FieldEstimate:
         With such borders: part of every cell in each region, by which logarithms of moduli are mixed.
     surface_bias : ndarray, shape (2 count,), or None
         What the motion of the surface, its weak prior and the noise had added to theta, and was taken off (see `surface.bias`).
+    free_law : FreeLaw or None
+        What moduli are with the shape of the law sought as well; None where strains are small, or no equilibrium was found.
     """
 
     mesh: Mesh
@@ -90,6 +93,7 @@ class FieldEstimate:
     borders: Borders | None = None
     parts: FloatArray | None = None
     surface_bias: FloatArray | None = None
+    free_law: FreeLaw | None = None
 
     @property
     def young_modulus(self) -> FloatArray:
@@ -105,8 +109,10 @@ class FieldEstimate:
         """Return lambda and mu of every cell (m,), kPa, known ones included."""
         return moduli_of(self.zones, self.theta)
 
-    def intervals(self, level: float = 0.95) -> tuple[FloatArray, FloatArray]:
+    def intervals(self, level: float = 0.95, *, law_exact: bool = False) -> tuple[FloatArray, FloatArray]:
         """Return the bounds of Young's modulus (count, 2), kPa, and of Poisson's ratio (count, 2) at a level of confidence.
+
+        They hold other forms of the law; with `law_exact` those that hold if the material obeys the law that was assumed.
 
         Raises
         ------
@@ -115,7 +121,7 @@ class FieldEstimate:
         """
         if self.uncertainty is None:
             raise InputError("a field of many moduli under a penalty has no intervals; see its `resolution`, or use regions")
-        return intervals(self.theta, self.uncertainty, level)
+        return intervals(self.theta, self.uncertainty.if_law_exact if law_exact else self.uncertainty, level)
 
     @property
     def limited_by_mesh(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.from_fields.assumptions import Assumption, effects
+from naibu.identification.from_fields.assumptions.other_assumptions import Assumption, effects
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, report
 from naibu.identification.verdict import Explanation, Verdict

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as sl
@@ -28,6 +29,19 @@ EXACT = 1e-9  # standard deviation of a logarithm that is rounding: that of the 
 UNIT = "the unit of the others"
 MESH_DEPENDENT = "not determined (depends on the mesh)"
 RESOLVED = 0.5
+HANGS = 1.5  # times its standard deviation with the law taken for right: what is so much less certain hangs on the law
+
+
+class LawPart(NamedTuple):
+    """What not knowing the law changes: logarithms (2 k,) with its shape sought, and by how much their covariance (2 k, 2 k) is more."""
+
+    shift: FloatArray
+    covariance: FloatArray
+
+    @property
+    def second_moment(self) -> FloatArray:
+        """What it adds to the second moment (2 k, 2 k) of errors of moduli that were found with the law taken for right."""
+        return np.asarray(self.covariance + np.outer(self.shift, self.shift))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,18 +53,21 @@ class Uncertainty:
     information : ndarray, shape (2 k, 2 k)
         Fisher information of ln mu, then ln(kappa / mu), the displacement of loaded nodes estimated as well.
     covariance : ndarray, shape (2 k, 2 k)
-        Its inverse; infinite on the diagonal where a modulus is not determined.
+        Its inverse, and what else there is to errors; infinite on the diagonal where a modulus is not determined.
     stretch : ndarray, shape (2 k,), or None
         Factors by which standard deviations of logarithms are larger than where the data were fitted, because errors of mu / kappa stayed
         while the size of elements was taken off it; None where nothing was.
     sides : ndarray, shape (2, k), or None
         How far the lower and the upper bound of ln E are away, over what its standard deviation says; None where they are as far.
+    law : LawPart or None
+        What of the covariance is that of the form of the law; None where that was not asked for.
     """
 
     information: FloatArray
     covariance: FloatArray
     stretch: FloatArray | None = None
     sides: FloatArray | None = None
+    law: LawPart | None = None
 
     @classmethod
     def of(cls, information: FloatArray, noise_factor: float = 1.0) -> Uncertainty:
@@ -68,6 +85,15 @@ class Uncertainty:
     def with_added(self, covariance: FloatArray) -> Uncertainty:
         """Return the uncertainty with independent errors of another covariance (2 k, 2 k) added; the information stays that of the data."""
         return replace(self, covariance=self.covariance + covariance)
+
+    def with_law(self, law: LawPart | None) -> Uncertainty:
+        """Return the uncertainty that holds that of the form of the law, where there is any."""
+        return self if law is None else replace(self.with_added(law.second_moment), law=law)
+
+    @property
+    def if_law_exact(self) -> Uncertainty:
+        """The uncertainty with the law taken for right."""
+        return self if self.law is None else replace(self.with_added(-self.law.second_moment), law=None)
 
     def stretched(self, stretch: FloatArray) -> Uncertainty:
         """Return the uncertainty of logarithms whose errors are larger by factors (2 k,); the information stays that of the data."""
@@ -178,8 +204,18 @@ def intervals(theta: FloatArray, found: Uncertainty, level: float = 0.95) -> tup
 
     Errors are normal in a logarithm: of E, and of mu / kappa before what the size of elements added to it was taken off. Towards
     incompressibility they are normal in mu / kappa itself: where its lower bound is below 0, Poisson's ratio may be 0.5. A modulus known
-    to no factor of `UNBOUNDED` has no bounds.
+    to no factor of `UNBOUNDED` has no bounds. Bounds that hold the form of the law hold both intervals, that with the law taken for right,
+    and that with its shape sought.
     """
+    exact = found.if_law_exact
+    if found.law is None:
+        return _bounds(theta, exact, level)
+    pairs = zip(_bounds(theta, exact, level), _bounds(theta + found.law.shift, exact.with_added(found.law.covariance), level), strict=True)
+    young, poisson = (np.stack([np.minimum(a, b)[:, 0], np.maximum(a, b)[:, 1]], axis=1) for a, b in pairs)
+    return young, poisson
+
+
+def _bounds(theta: FloatArray, found: Uncertainty, level: float) -> tuple[FloatArray, FloatArray]:
     k, quantile = len(theta) // 2, float(ndtri(0.5 + 0.5 * level))
     of_young, _ = found.of_young_and_poisson(theta)
     half = quantile * of_young[:, None] * (np.ones((k, 2)) if found.sides is None else found.sides.T)
@@ -211,13 +247,21 @@ def report(
     """
     young, poisson = young_and_poisson(theta)
     of_young, of_poisson = found.of_young_and_poisson(theta)
-    within = intervals(theta, found)
-    lines = []
+    within, exact = intervals(theta, found), intervals(theta, found.if_law_exact)[0]
+    lines, hangs = [], by_law(found, theta)
     for i, name in enumerate(zones.names):
         how = grade(of_young[i], usable=usable, sure=sure, apart=name in apart)
         line = _sentence(name, young[i], of_young[i], within[0][i], poisson[i], of_poisson[i], within[1][i], unit, how)
+        if hangs[i]:
+            line += f" If the law is exact, {exact[i, 0]:.4g} to {exact[i, 1]:.4g}{unit}."
         lines.append(line + ("" if budget is None or not np.isfinite(within[0][i, 1]) else _parts(budget, i, zones.count)))
     return (*lines, _worst(zones, found))
+
+
+def by_law(found: Uncertainty, theta: FloatArray) -> BoolArray:
+    """Whether not knowing the law makes the standard deviation of ln E of a zone (k,) half as large again or more."""
+    all_of_it, exact = (one.of_young_and_poisson(theta)[0] for one in (found, found.if_law_exact))
+    return np.isfinite(exact) & (exact > EXACT) & (all_of_it > HANGS * exact)
 
 
 def grade(of_young: float, *, usable: bool, sure: bool, apart: bool) -> str:

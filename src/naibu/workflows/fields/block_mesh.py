@@ -13,7 +13,7 @@ from naibu.core.arrays import AnyArray, FloatArray, IntArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.assumptions import MovedBorder
+from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder
 from naibu.io.images import read_volume
 from naibu.meshing.primitives import grid_cells
 from naibu.meshing.surface import boundary_faces

@@ -18,7 +18,7 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.assumptions import holds
+from naibu.identification.from_fields.assumptions.other_assumptions import holds
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN
@@ -299,18 +299,19 @@ def moduli_of_cells(found: FieldEstimate) -> tuple[FloatArray, FloatArray, Float
 
 
 def table_of_zones(result: FieldIdentification) -> Table:
-    """Return the table of moduli with their intervals, which take the law as given."""
+    """Return the table of moduli with their intervals, and those of Young's modulus with the law taken for right."""
     found = result.estimate
     rows: list[tuple[Cell, ...]] = []
     if found.uncertainty is not None:
         young, poisson = found.intervals()
+        exact = found.intervals(law_exact=True)[0]
         how = _grades(found, found.uncertainty)
         for i, name in enumerate(found.zones.names):
             e, nu = (float(values[i]) for values in (found.young_modulus, found.poisson_ratio))
-            rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i]), how[i]))
-    rows += [(name, *NO_VALUE, NOT_DETERMINED) for name in result.left_out]
+            rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i]), how[i], *map(float, exact[i])))
+    rows += [(name, *NO_VALUE, NOT_DETERMINED, 0.0, np.inf) for name in result.left_out]
     moduli = (f"Young's modulus, {result.unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
-    columns = ("zone", *moduli, "Young's modulus is")
+    columns = ("zone", *moduli, "Young's modulus is", "if the law is exact, 95 % from", "if the law is exact, to")
     return Table("Moduli", columns, tuple(rows))
 
 

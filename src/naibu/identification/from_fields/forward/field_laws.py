@@ -160,31 +160,6 @@ class NeoHookean:
         return of_lame, of_shear
 
 
-class Stiffening(NeoHookean):
-    """A neo-Hookean law with Yeoh's second term, ``mu c (I1 J^(-2/3) - 3)^2 / 2``; c is the ratio of his second constant to the first."""
-
-    def __init__(self, mesh: Mesh, *, averaged: bool, ratio: FloatArray) -> None:
-        super().__init__(mesh, averaged=averaged)
-        each, some = np.zeros(mesh.n_cells, dtype=np.int64), [material("yeoh", young_modulus=1.0, poisson_ratio=0.3)]
-        self._ratio, self._term = ratio, Assembler.from_materials(self._body.elements, each, some)
-
-    def forces(self, lame: FloatArray, shear: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the nodal forces (n, 3), mN, at a displacement (n, 3), mm; infinite where a cell is inverted."""
-        force = super().forces(lame, shear, u)
-        return force + self._more(shear).forces(u)[1] if np.isfinite(force).all() else force
-
-    def stiffness(self, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.bsr_matrix:
-        """Return the tangent stiffness (n d, n d), mN/mm."""
-        own, more = self.assembler(lame, shear).evaluate(u)[2], self._more(shear).evaluate(u)[2]
-        return self._body.together.pattern.matrix(own + more)
-
-    def _more(self, shear: FloatArray) -> Assembler:
-        """The assembler of the second term alone."""
-        table = np.zeros_like(self._term.parameters)
-        table[:, 1] = 0.5 * self._ratio * shear
-        return self._term.with_parameters(table)
-
-
 def field_law(mesh: Mesh, name: LawName, *, averaged: bool) -> FieldLaw:
     """Return the law of that name on a mesh, in 3-D with the mean dilatation of its cells or without.
 

@@ -145,6 +145,10 @@ class KeptPreconditioners:
         """Return the state before a first one."""
         return cls([None] * load_cases, [None] * load_cases)
 
+    def copied(self) -> KeptPreconditioners:
+        """Return the same for other points, which do not change these."""
+        return KeptPreconditioners(list(self.made), list(self.informed), self.spent)
+
     def forget(self) -> None:
         """Have all made anew on their next use."""
         self.made[:], self.spent = [None] * len(self.made), 0

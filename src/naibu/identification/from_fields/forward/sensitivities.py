@@ -135,10 +135,14 @@ class FieldModel:
         return out
 
     def with_law(self, law: LawName) -> FieldModel:
-        """Return the model of the same load cases under another law."""
+        """Return the model of the same load cases under the law of that name."""
+        return self.under(field_law(self.computed, law, averaged=self.averaged))
+
+    def under(self, law: FieldLaw) -> FieldModel:
+        """Return the model of the same load cases under another law on the mesh on which equilibrium is computed."""
         out = object.__new__(FieldModel)
         out.__dict__.update(self.__dict__)
-        out.law = field_law(self.computed, law, averaged=self.averaged)
+        out.law = law
         out.solvers = Solvers(out.law, self.points)
         out.boundary = KeptPreconditioners.none(len(self.observed))
         return out

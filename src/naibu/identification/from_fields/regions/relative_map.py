@@ -15,7 +15,8 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress
-from naibu.identification.from_fields.assumptions import Assumption, hangs_on_law
+from naibu.identification.from_fields.assumptions.assumed_law import hangs_on_law
+from naibu.identification.from_fields.assumptions.other_assumptions import Assumption
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
@@ -33,7 +34,7 @@ from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.inversion.regularization import cell_volumes, inner_faces
 from naibu.identification.from_fields.mesh_error import TOO_COARSE
 from naibu.identification.from_fields.statement import statement
-from naibu.identification.from_fields.uncertainty import Uncertainty, intervals, young_and_poisson_slopes
+from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, intervals, young_and_poisson_slopes
 from naibu.identification.from_fields.verdict import FEW_POINTS, told_points
 from naibu.identification.from_fields.verdict_within_cells import with_limits
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
@@ -115,7 +116,8 @@ def relative_to(found: Uncertainty, theta: FloatArray, zone: int) -> Uncertainty
     along = found.information @ of_shear
     free = found.information - np.outer(along, along) / max(float(of_shear @ along), 1e-300)  # the common factor is not known
     free[zone, zone] += float(np.diag(found.information).max())
-    return Uncertainty(free, covariance, found.stretch)
+    law = found.law and LawPart(change @ found.law.shift, change @ found.law.covariance @ change.T)
+    return Uncertainty(free, covariance, found.stretch, law=law)
 
 
 def without_poisson(found: Uncertainty) -> Uncertainty:
@@ -125,7 +127,7 @@ def without_poisson(found: Uncertainty) -> Uncertainty:
     covariance[k:, :] = covariance[:, k:] = 0.0
     bulk = np.arange(k, 2 * k)
     covariance[bulk, bulk] = np.inf
-    return Uncertainty(found.information, covariance, found.stretch)
+    return Uncertainty(found.information, covariance, found.stretch, law=found.law)
 
 
 def _relative(found: FieldEstimate, few: str = "") -> FieldEstimate:
@@ -149,9 +151,8 @@ def _relative(found: FieldEstimate, few: str = "") -> FieldEstimate:
     others = tuple(replace(one, theta=_divided(one.theta, _of_unit(one, found.theta, zone))) for one in found.assumptions)
     regularized = found.regularized and (found.regularized[0] / np.exp(unit), found.regularized[1])
     assert found.verdict is not None  # of regions that were fitted without a penalty
-    bounds = intervals(theta, uncertainty)[0]
-    of_law = hangs_on_law(others, theta, bounds)
-    judged = with_limits(replace(found.verdict, limits=few), found.zones.names, None, bounds, "", of_law=of_law)
+    of_law = hangs_on_law(found.verdict, found.free_law, uncertainty, theta)
+    judged = with_limits(replace(found.verdict, limits=few), found.zones.names, None, intervals(theta, uncertainty)[0], "", of_law=of_law)
     found = replace(found, verdict=judged)
     return replace(
         found, theta=theta, uncertainty=uncertainty, assumptions=others, regularized=regularized, budget=None,

@@ -12,22 +12,17 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError
-from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.forward.field_laws import FieldLaw, LawName, Stiffening, field_law
+from naibu.identification.from_fields.forward.field_laws import FieldLaw, LawName, field_law
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium
 from naibu.identification.from_fields.forward.load_cases import KnownRegion, Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
 from naibu.identification.from_fields.mesh_error import change_of_fit
-from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 OTHER_YOUNG, OTHER_POISSON = 0.1, 0.02  # changes whose effect is stated: relative, of Young's modulus; absolute, of Poisson's ratio
 MOST_POISSON = 0.499
 OTHER_LAW: dict[LawName, LawName] = {"linear": "neo_hookean", "neo_hookean": "linear"}
 LAW_NAMES = {"linear": "small strain", "neo_hookean": "a neo-Hookean law at finite strain"}
-STIFFENING = 0.3  # Yeoh's second constant over the first, whose standard deviation in identification from markers is 1
-LEAST_GROWTH = 0.0015  # of stress by stiffening, below which it does not matter: strains of 3.5 per cent
-FEW_ZONES = 4  # zones that are taken each by itself
 ROUNDING = 1e-9  # of the unit of relative moduli, whose interval has no width
 
 
@@ -43,14 +38,11 @@ class Assumption:
         By how much it would change ln mu and ln(kappa / mu) of the zones, to first order.
     standard_deviations : float
         How many standard deviations it is away from what was assumed; zero where it is a question of the model.
-    of_law : bool
-        Whether it is that stress grows otherwise with strain.
     """
 
     text: str
     theta: FloatArray
     standard_deviations: float
-    of_law: bool = False
 
     def applied(self, theta: FloatArray) -> FloatArray:
         """Return the logarithms of the moduli (2 count,) under the assumption, from those found.
@@ -104,48 +96,12 @@ def assumptions(
         if changed is not None:
             out.append(Assumption(border.text, changed, border.standard_deviations))
     if model.mesh.dimension == 3:
-        out += _stiffening(at, quadratic, law)
         lame, shear = moduli_of(model.zones, at.point.theta)
         other = OTHER_LAW[law]
         changed = _refitted(at, quadratic, field_law(model.computed, other, averaged=model.averaged), lame, shear)
         if changed is not None:
             out.append(Assumption(f"with {LAW_NAMES[other]}", changed, 0.0))
     return tuple(replace(one, theta=one.theta * stretch) for one in out)
-
-
-def _stiffening(at: Linearised, quadratic: Concentrated, law: LawName) -> list[Assumption]:
-    """Return what known regions, and what unknown zones would do if they stiffened with strain more than the law says.
-
-    Nothing where strains are so small that this hardly changes stress. What stiffening does to a linear law is what it does to a
-    neo-Hookean one.
-    """
-    model = at.model
-    if max(_growth(model.computed, u) for u in at.point.states) < LEAST_GROWTH:
-        return []
-    lame, shear = moduli_of(model.zones, at.point.theta)
-    own = model.law if law == "neo_hookean" else field_law(model.computed, "neo_hookean", averaged=model.averaged)
-    zone, region = model.zones.of_cell, model.zones.region_of_cell
-    groups = {f"{r.name!r}": np.asarray(region == number) for number, r in enumerate(model.zones.known)}
-    if model.zones.count <= FEW_ZONES:
-        groups |= {f"{name!r}": np.asarray(zone == i) for i, name in enumerate(model.zones.names)}
-    else:
-        groups["what is sought"] = np.asarray(zone >= 0)
-    out = []
-    for name, cells in groups.items():
-        more = Stiffening(model.computed, averaged=model.averaged, ratio=np.where(cells, STIFFENING, 0.0))
-        changed = _refitted(at, quadratic, more, lame, shear, than=own)
-        if changed is not None and cells.any():
-            out.append(Assumption(f"with {name} stiffening with strain (c20 of {STIFFENING:g} c10)", changed, 0.0, of_law=True))
-    return out
-
-
-def _growth(mesh: Mesh, u: FloatArray) -> float:
-    """Return by which part, root mean square, stress grows at a displacement (n, 3), mm, by stiffening."""
-    discrete = elements(mesh, "standard")
-    gradient = np.einsum("mai,mqaj->mqij", u[mesh.cells], discrete.gradients, optimize=True)
-    strain = 0.5 * (gradient + np.swapaxes(gradient, 2, 3))
-    strain -= np.einsum("mqkk->mq", strain)[:, :, None, None] / 3.0 * np.eye(3)
-    return float(np.sqrt(np.mean((2.0 * STIFFENING * 2.0 * (strain**2).sum(axis=(2, 3))) ** 2)))
 
 
 def covariance_of(found: tuple[Assumption, ...], size: int) -> FloatArray:
@@ -190,15 +146,6 @@ def effects(found: tuple[Assumption, ...], zones: Zones, theta: FloatArray, with
     return tuple(lines)
 
 
-def hangs_on_law(found: tuple[Assumption, ...], theta: FloatArray, within: FloatArray) -> str:
-    """Say, in words that follow "but", whether Young's moduli with intervals `within` (count, 2), kPa, hang on the law; empty if not."""
-    for one in found:
-        other = young_and_poisson(one.applied(theta))[0]
-        if one.of_law and not all(holds(low, high, e) for e, (low, high) in zip(other, within, strict=True)):
-            return "moduli hang on the assumed law"
-    return ""
-
-
 def _named(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} other zone{'s' if len(names) > 2 else ''}"
 
@@ -218,19 +165,12 @@ def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
     return [(f"with {stiffer:.4g} kPa for {young:.4g} kPa of {region.name!r}", stiffer, poisson, of_young), other_ratio]
 
 
-def _refitted(
-    at: Linearised, quadratic: Concentrated, law: FieldLaw, lame: FloatArray, shear: FloatArray, than: FieldLaw | None = None
-) -> FloatArray | None:
-    """Return the change (2 count,) of theta when equilibrium is that of other moduli or another law; None where there is none.
-
-    The other law counts as it differs from that of the model, or from the law `than`.
-    """
+def _refitted(at: Linearised, quadratic: Concentrated, law: FieldLaw, lame: FloatArray, shear: FloatArray) -> FloatArray | None:
+    """Return the change (2 count,) of theta when equilibrium is that of other moduli or another law; None where there is none."""
     model = at.model
     solvers, changes = Solvers(law, model.points), []
     try:
         for o, u in zip(model.observed, at.point.states, strict=True):
-            if than is not None and than is not model.law:
-                u, _ = equilibrium(than, Solvers(than, model.points), lame, shear, o.load_case, u, b"")
             state, _ = equilibrium(law, solvers, lame, shear, o.load_case, u, b"")
             changes.append(np.asarray(o.operator @ (state - u).ravel()))
         return change_of_fit(at, quadratic, changes)

@@ -1,0 +1,110 @@
+"""The law that was assumed: where it matters, whether fields speak against it, and what hangs on it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from naibu.core.arrays import FloatArray
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.assumptions.free_law import FreeLaw, free_law
+from naibu.identification.from_fields.forward.load_cases import Zones
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, young_and_poisson
+from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law
+from naibu.identification.verdict import Explanation, Verdict
+from naibu.mechanics.finite_elements.elements import elements
+
+LEAST_STRAIN = 0.02  # equivalent strain, root mean square, below which forms of the law change stress by 2 per cent at most
+UNLIKELY = 1e-3  # probability of so large a score by chance, below which fields speak against the law
+MODULUS = 0.1  # change of the logarithm of a modulus from which on it matters
+DOES_NOT_FIT = "the law does not fit"
+HANGS_ON_LAW = "moduli hang on the assumed law"
+NOT_SOUGHT = "moduli may hang on the assumed law, as no equilibrium was found with its shape sought as well"
+OF_MAP = "The map takes the law for right at strains of {:.2g} per cent: what stiffens with strain looks like another modulus."
+LISTED = 2
+
+
+def equivalent_strain(mesh: Mesh, u: FloatArray) -> float:
+    """Return the root mean square of the equivalent strain, ``sqrt(2 e:e / 3)`` of the deviator e, at a displacement (n, 3), mm."""
+    discrete = elements(mesh, "standard")
+    gradient = np.einsum("mai,mqaj->mqij", u[mesh.cells], discrete.gradients, optimize=True)
+    strain = 0.5 * (gradient + np.swapaxes(gradient, 2, 3) + np.einsum("mqki,mqkj->mqij", gradient, gradient, optimize=True))
+    strain -= np.einsum("mqkk->mq", strain)[:, :, None, None] / 3.0 * np.eye(3)
+    return float(np.sqrt(np.average(2.0 / 3.0 * (strain**2).sum(axis=(2, 3)), weights=discrete.weights)))
+
+
+def largest_strain(model: FieldModel, states: Sequence[FloatArray]) -> float:
+    """Return the largest `equivalent_strain` of all states (n, d), mm; zero of bodies that are not in three dimensions."""
+    return max(equivalent_strain(model.computed, u) for u in states) if model.mesh.dimension == 3 else 0.0
+
+
+def with_law_free(
+    at: Linearised, residuals: Sequence[FloatArray] | None, freedom: float, stretch: FloatArray
+) -> tuple[FreeLaw | None, LawPart | None]:
+    """Return moduli with the shape of the law sought as well, from the best fit, and what that means for their uncertainty.
+
+    None where strains are too small for that to matter; no uncertainty either where no equilibrium was found.
+
+    Parameters
+    ----------
+    at : Linearised
+        At the best fit.
+    residuals : sequence of ndarray, shape (q,), or None
+        Whitened residuals on elements of half the size; None where these were not computed.
+    freedom : float
+        Degrees of freedom.
+    stretch : ndarray, shape (2 count,)
+        By how much changes of logarithms are larger at vanishing element size (see `mesh_error.stretch_of`).
+    """
+    if largest_strain(at.model, at.point.states) < LEAST_STRAIN:
+        return None, None
+    pairs = zip(at.model.observed, at.point.states, strict=True)
+    here = [o.residual(u) for o, u in pairs]
+    free = free_law(at, None if residuals is None else [r - h for r, h in zip(residuals, here, strict=True)], freedom)
+    return free, LawPart(stretch * free.shift, free.covariance * np.outer(stretch, stretch)) if free.found else None
+
+
+def judged(judged: Verdict, free: FreeLaw | None, zones: Zones, theta: FloatArray, total: Uncertainty) -> tuple[Verdict, str]:
+    """Return the verdict with what fields say against the law, where that changes a modulus by much; and what hangs on the law."""
+    against = _against(free, zones, theta)
+    if against:
+        part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
+        judged = replace(judged, explanation=part, reasons=(against, *judged.reasons))
+    return judged, hangs_on_law(judged, free, total, theta)
+
+
+def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray) -> str:
+    """Say that fields ask for another law under which a modulus would be another one by much; empty if they do not."""
+    if free is None or not free.found:
+        return ""
+    law, probability = min(free.probabilities.items(), key=lambda one: one[1])
+    change = np.log(young_and_poisson(theta + free.shift)[0] / young_and_poisson(theta)[0])
+    moved = [i for i in np.argsort(-np.abs(change)).tolist() if abs(change[i]) > MODULUS]
+    if probability > UNLIKELY or not moved:
+        return ""
+    each = [
+        f"that of {zones.names[i]} {100.0 * abs(np.expm1(change[i])):.0f} % {'higher' if change[i] > 0.0 else 'lower'}"
+        for i in moved[:LISTED]
+    ]
+    return (
+        f"{DOES_NOT_FIT}: fields ask for stress that grows otherwise with strain, as in a {law} law; with its shape sought as well, "
+        f"Young's modulus would be another one: {' and '.join(each)}"
+    )
+
+
+def hangs_on_law(judged: Verdict, free: FreeLaw | None, total: Uncertainty, theta: FloatArray) -> str:
+    """Say, in words that follow "but", whether Young's moduli hang on the law; empty if not, or if the verdict says more of it."""
+    if free is None or any(reason.startswith(DOES_NOT_FIT) for reason in judged.reasons):
+        return ""
+    if not free.found:
+        return NOT_SOUGHT
+    return HANGS_ON_LAW if by_law(total, theta).any() else ""
+
+
+def warned(strain: float, sentences: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the sentences on a map without intervals, the first of which says that it takes the law for right, where that matters."""
+    if strain < LEAST_STRAIN or not sentences:
+        return sentences
+    return (f"{sentences[0]} {OF_MAP.format(100.0 * strain)}", *sentences[1:])

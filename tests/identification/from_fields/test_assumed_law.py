@@ -1,0 +1,112 @@
+"""Intervals that hold the form of the law: fields of gels that another program computed with other laws, identified as neo-Hookean."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from naibu.core.displacement_field import DisplacementField
+from naibu.identification.from_fields.assumptions.assumed_law import (
+    DOES_NOT_FIT,
+    HANGS_ON_LAW,
+    NOT_SOUGHT,
+    equivalent_strain,
+    judged,
+    warned,
+)
+from naibu.identification.from_fields.assumptions.free_law import FreeLaw
+from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.field_estimate import FieldEstimate
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law, intervals
+from naibu.identification.verdict import Explanation, Verdict
+from naibu.meshing.primitives import box
+
+SOFT, HARD, POISSON_RATIO = 100.0, 300.0, 0.45
+EXPLAINED = Verdict(Explanation.EXPLAINED, (), "small residuals", 1.0, 0.0, 0.0)
+
+
+@cache
+def found(law: str, scale: float = 1.0, seed: int = 1) -> FieldEstimate:
+    """Identify the harder of two gels in a cube of 60 mm from 400 points of a field, scaled, with noise of 1 % of its largest vector.
+
+    The cube was compressed by a fifth between rough plates by another program: 250 quadratic hexahedra in a quarter, neo-Hookean with
+    ``-mu ln J + lambda (ln J)^2 / 2``, and Yeoh's law of c20 1 and c30 0.5 times c10 with ``kappa (J - 1)^2 / 2``.
+    """
+    columns = {"neo_hookean": slice(3, 6), "yeoh": slice(6, 9)}
+    table = np.loadtxt(Path(__file__).with_name("two_gels.csv"), delimiter=",", skiprows=1)
+    mesh = box((60.0,) * 3, (8, 8, 8), layers=[("soft", 30.0), ("hard", 30.0)], centred=True)
+    points, u = table[:, :3] + [0.0, 0.0, mesh.points[:, 2].min()], scale * table[:, columns[law]]
+    sd = 0.01 * float(np.linalg.norm(u, axis=1).max())
+    field = DisplacementField.from_arrays(points, u + sd * np.random.default_rng(seed).standard_normal(u.shape), sd_mm=sd)
+    plates = np.abs(np.abs(mesh.points[:, 2] - mesh.points[:, 2].mean()) - 30.0) < 1e-9
+    zones = Zones.of(mesh, known={"soft": (SOFT, POISSON_RATIO)})
+    return identify_field(mesh, [FieldLoadCase.of("pressed", field, mesh, loaded=plates)], zones, law="neo_hookean")
+
+
+def test_a_gel_that_stiffens_is_held_and_the_verdict_says_that_the_law_does_not_fit() -> None:
+    estimate = found("yeoh")
+    low, high = estimate.intervals()[0][0]
+    exact = estimate.intervals(law_exact=True)[0][0]
+    assert low < HARD < high and not exact[0] < HARD < exact[1]
+    assert low == pytest.approx(exact[0]) and high < 1.25 * HARD  # the data tell how it stiffens: the prior alone says nothing
+    assert estimate.intervals()[1][0, 0] < POISSON_RATIO < estimate.intervals()[1][0, 1]
+    verdict, free = estimate.verdict, estimate.free_law
+    assert verdict is not None and free is not None and free.settled
+    assert verdict.explanation is Explanation.IN_PART and verdict.reasons[0].startswith(DOES_NOT_FIT) and "hard" in verdict.reasons[0]
+    assert free.probabilities["yeoh"] < 1e-6
+    assert abs(free.shapes[0, 1] - 1.0) < 2.0 * free.shapes_sd[0, 1]
+    assert any("If the law is exact" in line for line in estimate.identifiability)
+
+
+def test_a_neo_hookean_gel_is_held_and_known_as_well_as_the_field_tells_its_law() -> None:
+    estimate = found("neo_hookean")
+    low, high = estimate.intervals()[0][0]
+    exact = estimate.intervals(law_exact=True)[0][0]
+    assert low < HARD < high and exact[0] < HARD < exact[1]
+    assert high / low < 1.9  # with the prior of the law alone 12 times
+    assert estimate.verdict is not None and estimate.verdict.sentence.startswith(f"Explained, but {HANGS_ON_LAW}")
+
+
+def test_below_two_per_cent_of_strain_the_law_is_no_question() -> None:
+    estimate = found("neo_hookean", 0.02)
+    assert estimate.free_law is None
+    assert np.array_equal(estimate.intervals()[0], estimate.intervals(law_exact=True)[0])
+
+
+def test_equivalent_strain_of_a_stretched_and_turned_bar() -> None:
+    """An isochoric stretch by e has the equivalent strain e, at small strain; turning adds none."""
+    mesh = box((10.0, 10.0, 20.0), (1, 1, 2), centred=False)
+    angle = np.deg2rad(30.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+    moved = mesh.points * (1.0 + np.array([-0.5, -0.5, 1.0]) * 1e-4) @ turn.T
+    assert equivalent_strain(mesh, moved - mesh.points) == pytest.approx(1e-4, rel=1e-3)
+
+
+def test_bounds_hold_both_intervals() -> None:
+    theta, plain = np.log([100.0, 8.0]), Uncertainty(np.eye(2), np.diag([0.01, 0.01]))
+    shift, more = np.array([0.3, 0.0]), np.diag([0.02, 0.0])
+    total = plain.with_law(LawPart(shift, more)).with_added(np.diag([0.01, 0.0]))
+    own = plain.with_added(np.diag([0.01, 0.0]))
+    young = intervals(theta, total)[0][0]
+    assert young[0] == pytest.approx(intervals(theta, own)[0][0, 0])
+    assert young[1] == pytest.approx(intervals(theta + shift, own.with_added(more))[0][0, 1])
+    assert intervals(theta, total.if_law_exact)[0] == pytest.approx(intervals(theta, own)[0])
+    assert by_law(total, theta).all() and not by_law(own, theta).any()
+
+
+def test_where_no_equilibrium_is_found_with_the_law_free_that_is_said() -> None:
+    theta, plain = np.log([100.0, 8.0]), Uncertainty(np.eye(2), np.diag([0.01, 0.01]))
+    mesh = box((10.0, 10.0, 20.0), (1, 1, 2), layers=[("a", 10.0), ("b", 10.0)], centred=False)
+    zones = Zones.of(mesh, known={"a": (10.0, 0.45)})
+    assert judged(EXPLAINED, FreeLaw.lost(("a", "b"), 2), zones, theta, plain) == (EXPLAINED, NOT_SOUGHT)
+    assert judged(EXPLAINED, None, zones, theta, plain) == (EXPLAINED, "")
+
+
+def test_a_map_says_first_that_it_takes_the_law_for_right() -> None:
+    assert warned(0.01, ("Resolved.", "More.")) == ("Resolved.", "More.")
+    first, second = warned(0.2, ("Resolved.", "More."))
+    assert first.startswith("Resolved. The map takes the law for right at strains of 20 per cent") and second == "More."
