@@ -227,14 +227,40 @@ def test_a_body_of_which_two_steps_fail_one_after_the_other_is_stopped_and_that_
         patch.setattr(type(touched._session), "step", fails)
         first = touched.advance()
         assert np.abs(touched._session.state().velocity).max() > 1.0 and "stopped" not in first.failed
-        second = touched.advance()
         loop = RealTimeLoop(touched)
         loop._advance(0.0)
+        second = loop.latest()[0]
         assert loop.trouble() == second.failed and loop.trouble() == ""  # the page says it, once
     assert second.failed == "no balance; the body was stopped where it was"
     np.testing.assert_array_equal(second.positions, good.positions)
     np.testing.assert_array_equal(touched._session.state().velocity, 0.0)
     assert not touched.advance().failed
+    touched.close()
+
+
+def test_a_body_that_finds_no_balance_any_more_begins_anew_from_its_shape_at_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut to loose pieces under a tool, each step had failed for ever, tool and body standing still, until somebody pressed Reset."""
+    touched = InteractiveSimulation(lattice_or_gel("gel"), {"sphere": spherical_indenter((20.0, 20.0, 60.0), 8.0)})
+    touched.take("sphere")
+    touched.move((20.0, 20.0, TOP + 4.0))
+    while touched.last.force[2] == 0.0:
+        touched.advance()
+    step, kept = RealTimeSession.step, len(touched._kept)
+
+    def fails_unless_at_rest(session: RealTimeSession, *given: object, **named: object) -> object:
+        if np.abs(session.state().displacement).max() > 1.0:
+            raise ConvergenceError("no balance")
+        return step(session, *given, **named)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(RealTimeSession, "step", fails_unless_at_rest)
+    frames = [touched.advance() for _ in range(5)]
+    assert [frame.failed.partition("; ")[2] for frame in frames] == [
+        "", "the body was stopped where it was", "the body was put back into its shape at rest", "", "",
+    ]  # fmt: skip
+    np.testing.assert_array_equal(frames[2].positions, touched.body.points)
+    assert not any(frame.failed for frame in frames[3:]) and frames[-1].tool == "sphere" and not frames[-1].force.any()
+    np.testing.assert_array_equal(frames[2].tool_centre, (20.0, 20.0, 60.0))
+    assert len(touched._kept) == kept  # what Undo returns to is what it was
     touched.close()
 
 

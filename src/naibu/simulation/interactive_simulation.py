@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import FloatArray, IntArray, as_vector, require_positive
 from naibu.core.errors import ConvergenceError, InputError
@@ -27,13 +26,12 @@ from naibu.simulation.frame import Frame, KeptState
 from naibu.simulation.held_tool import HeldTool, outside_planes
 from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
 from naibu.simulation.lattice_cut import LatticeCut
-from naibu.simulation.tool_places import FollowedHand, farthest_in_a_step, placed, towards, waiting_place
+from naibu.simulation.tool_places import FollowedHand, farthest_in_a_step, placed, towards, turning_towards, waiting_place
 
 FRAME_S = 1.0 / 60.0
 REACH = 2.0  # extents of the body around its centre in which the tool stays
 SPEED = 3.0  # extents of the body a second that tool and grip move at most
-TURNING = 3.0  # rad/s that the tool turns at most
-LEAST_TURN = 1e-6  # rad
+PATIENCE = 2  # steps without a balance, one after the other, behind which the next one has the body begin anew from its shape at rest
 UNDO = 20  # states kept
 LEAVING_S = 3.0  # simulated time in which a tool that is put away leaves the body at the latest
 
@@ -313,7 +311,8 @@ class InteractiveSimulation:
     def advance(self) -> Frame:
         """Take the steps of one frame, and return it; a step that fails is taken back, and the frame says why.
 
-        Where the next one fails too, the body is stopped where it was, and the frame says so.
+        Where the next one fails too, the body is stopped where it was, and the frame says so. Where that does not help either, nothing would
+        move again: the body begins anew from its shape at rest, with its cuts and the tool where it waits, and the frame says so.
         A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was when the step began.
         """
         self._leave()
@@ -329,6 +328,10 @@ class InteractiveSimulation:
             if self._failures > 1:  # where it moves on to is what has no balance
                 before, said = self.body.at_rest(before), f"{said}; the body was stopped where it was"
             self._session.restore(before)
+            if self._failures > PATIENCE:
+                said = f"{error}; the body was put back into its shape at rest"
+                self._begin(self.body)
+                self._press(self._tool)
             self._target, self._rotation_target = self._centre, self._rotation
             self._pull_target = self._grip_position()
             self._tool_hand.stop()
@@ -378,7 +381,7 @@ class InteractiveSimulation:
         centre = self._tool_hand.next_place(self._centre, self._target, duration, self.delay_s)
         pulled = self._grip_hand.next_place(gripped, self._pull_target, duration, self.delay_s)
         if self._tool:
-            tool, spin = self.tools[self._tool], self._spin(duration) * (not self._held.crushed)
+            tool, spin = self.tools[self._tool], turning_towards(self._rotation, self._rotation_target, duration) * (not self._held.crushed)
             if self.body.fixtures:
                 turned = placed(tool, centre, rotation_matrix(duration * spin) @ self._rotation)
                 centre = outside_planes(self.body.fixtures, turned, centre)
@@ -408,13 +411,6 @@ class InteractiveSimulation:
     def _motions(self, velocity: FloatArray, spin: FloatArray) -> list[IndenterVelocity]:
         still = [IndenterVelocity() for _ in self.body.fixtures]
         return [*still, IndenterVelocity(velocity, spin)] if self._tool else still
-
-    def _spin(self, duration: float) -> FloatArray:
-        """Return the angular velocity (3,), rad/s, of the tool in a frame."""
-        if np.linalg.norm(self._rotation_target - self._rotation) <= 2.0**0.5 * LEAST_TURN:  # the norm is 8^(1/2) sin(angle / 2)
-            return np.zeros(3)
-        left = Rotation.from_matrix(self._rotation_target @ self._rotation.T).as_rotvec()
-        return np.asarray(left / max(duration, float(np.linalg.norm(left)) / TURNING))
 
     def _press(self, tool: str) -> None:
         """Bring the fixtures and a tool, where it waits, into play."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
@@ -12,6 +13,8 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 THROUGH = 0.5  # of the thinnest half extent of a tool
 MOST_RAISED = 40  # steps
 ARRIVED_MM = 1e-4
+TURNING = 3.0  # rad/s that a tool turns at most
+LEAST_TURN = 1e-6  # rad
 
 
 @dataclass(slots=True, eq=False)
@@ -49,6 +52,14 @@ def towards(start: FloatArray, target: FloatArray, reach: float) -> FloatArray:
     way = target - start
     length = float(np.linalg.norm(way))
     return np.asarray(target if length <= reach else start + way * (reach / length), dtype=float)
+
+
+def turning_towards(rotation: FloatArray, wanted: FloatArray, duration_s: float) -> FloatArray:
+    """Return the angular velocity (3,), rad/s, at which a tool turns to a rotation (3, 3) in a time, s, or in more at its fastest."""
+    if np.linalg.norm(wanted - rotation) <= 2.0**0.5 * LEAST_TURN:  # the norm is 8^(1/2) sin(angle / 2)
+        return np.zeros(3)
+    left = Rotation.from_matrix(wanted @ rotation.T).as_rotvec()
+    return np.asarray(left / max(duration_s, float(np.linalg.norm(left)) / TURNING))
 
 
 def waiting_place(tool: RigidIndenter, points: FloatArray, step_mm: float) -> FloatArray:

@@ -16,7 +16,7 @@ from naibu.mechanics import Assembler, elements, material, spherical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, HapticHand, InteractiveSimulation, RealTimeLoop, SimulatedDevice
 from naibu.simulation.haptics.haptic_loop import CONTACT, HOLDS, LEAVES_S, STALE
-from naibu.simulation.interactive_simulation import LEAST_TURN
+from naibu.simulation.tool_places import LEAST_TURN
 from naibu.workflows.interactive.haptics.packets import pose_bytes, read_force
 
 START = 54.0

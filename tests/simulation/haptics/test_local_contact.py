@@ -14,7 +14,8 @@ from naibu.mechanics import Assembler, elements, material, spherical_indenter
 from naibu.meshing import box
 from naibu.simulation import FiniteElementBody, ForceLimits, Frame, HapticHand, InteractiveSimulation, LocalContact, SimulatedDevice
 from naibu.simulation.haptics.local_contact import LocalFrame, LocalReaction
-from naibu.simulation.interactive_simulation import FRAME_S, LEAST_TURN
+from naibu.simulation.interactive_simulation import FRAME_S
+from naibu.simulation.tool_places import LEAST_TURN
 
 STEP_S = 1e-3
 RADIUS, EDGE = 8.0, 40.0

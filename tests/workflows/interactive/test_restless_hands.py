@@ -8,7 +8,7 @@ from touched_models import MODELS
 from watched_page import driven
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", ["lattice", "mesh", "gel"])
 def test_random_hands_do_no_harm(kind: str, seed: int) -> None:
     """No exception, nothing infinite, nothing flung away, undo exact, volumes kept by cuts, and all comes to rest."""
