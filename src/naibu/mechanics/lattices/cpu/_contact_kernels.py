@@ -67,7 +67,8 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
     count, indenters, motion, surface, history, lists, slid, points, slot, diagonal, room, (nodal, covered, together) = contact
     given, plain, origin = vectors
     operator = inner[OPERATOR]
-    strict = 1.0 if tolerance >= LOOSE else STRICT
+    exact = tolerance < LOOSE
+    strict = STRICT if exact else 1.0
     iterations, lost, goal, share, ended, ended_before = 0, 0.0, 0.0, 0.0, False, False
     for attempt in range(-1, most):  # before the first solution, points are linearized about the velocity as it is
         if attempt >= 0:
@@ -76,7 +77,7 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
                 change_contacts(data, given, -1.0)
             forget_impulses(operator, given)
             if not attempt:
-                floor = plain_residual(data, plain, origin)
+                floor = plain_residual(data, plain, origin, exact)
             assemble(count, step, surface, lists, points[0], given, operator, room[4])
             close_operator(operator, smoother, slot, diagonal)
             follow_contacts(inner[8], smoother, data[0][6], (operator[0], operator[1], operator[5][FACES]), iterations)
@@ -84,12 +85,13 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
             if not attempt:
                 goal, share = extrapolate(data, ahead, tolerance, floor)
             rough = ROUGHLY**2 * residual_norm(r, smoother, data[0][6])
-            ended = tolerance < LOOSE or rough <= goal or attempt >= min(ROUGH_PASSES, most - 1)
-            if ended:
+            ended = exact or rough <= goal or attempt >= min(ROUGH_PASSES, most - 1)
+            if exact:
                 iterations += solve_exactly(data, goal, limit, given, plain, origin)
-                lost = settle_in_contact(data)
             else:
-                iterations += solve_roughly(data[0], rough, limit)
+                iterations += solve_roughly(data[0], goal if ended else rough, limit)
+            if ended:
+                lost = settle_in_contact(data)
         if attempt > 0 and not ended_before:  # what begins to slip is not decided by a rough solution
             _slid_before(count, surface, history, lists, slid)
         begins, ended_before = attempt < 0, ended
