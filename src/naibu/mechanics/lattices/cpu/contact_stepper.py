@@ -18,7 +18,7 @@ from naibu.mechanics.lattices.cpu._contact_kernels import contact_steps
 from naibu.mechanics.lattices.cpu._contact_multipliers import COLUMNS
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 from naibu.mechanics.lattices.cpu._contact_points import COLUMNS as POINT_COLUMNS
-from naibu.mechanics.lattices.cpu._contact_points import RESULTS, rest_at
+from naibu.mechanics.lattices.cpu._contact_points import RESULTS, new_room, rest_at
 from naibu.mechanics.lattices.cpu.explicit_contact import ElementForces, no_elements
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, TOUCHED
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import COARSE, POOL
@@ -257,7 +257,7 @@ def _scratch(faces: int, indenters: int, points: int, pad: int) -> KernelTuple:
     slots = min(4 * faces, pad)
     operator = new_operator(pairs, slots)
     nodal = (np.full(pad, -1, np.int64), np.zeros((slots, 3, 3)), np.zeros((COLUMNS, indenters, pad)))
-    return operator, lists, exerted, np.zeros(points, np.bool_), *nodal
+    return operator, lists, exerted, np.zeros(points, np.bool_), *nodal, new_room()
 
 
 @dataclass(slots=True, eq=False)
