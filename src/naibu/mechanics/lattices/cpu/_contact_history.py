@@ -11,8 +11,8 @@ from naibu.mechanics.lattices.cpu._contact_points import ALONG, FORCE, FREE, HAR
 GONE = 1e-9  # compression of a foundation that counts as none, mm
 
 
-@njit(cache=True)
-def pull_off(count, x, v, step, mass, indenters, motion, surface, history, lists, base, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+@njit(cache=True, **UNCOUNTED)
+def pull_off(count, x, v, step, mass, indenters, motion, surface, history, lists, base, reaction, room):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add the impulses of pull-off to `base`: on points that touched an indenter and leave it slowly, never more than stops them."""
     (geometry, axes), centres, _, pull, _ = indenters
     velocity, spin = motion
@@ -20,7 +20,7 @@ def pull_off(count, x, v, step, mass, indenters, motion, surface, history, lists
     mode, touched = history[0], history[1]
     body, face = lists[0], lists[1]
     pad = len(mass)
-    slip, d, q, m, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
+    _, _, (_, slip, d, q, m, n), none, _ = room
     for entry in range(count):
         k, f = body[entry], face[entry]
         if pull[k, 2] <= 0.0:

@@ -15,7 +15,7 @@ from naibu._numba.thread_pool import begin_step, end_step
 from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off
 from naibu.mechanics.lattices.cpu._contact_multipliers import settle_multipliers, update_multipliers
 from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, close_operator
-from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces, new_room
+from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces
 from naibu.mechanics.lattices.cpu._contact_solver import (
     change_contacts,
     extrapolate,
@@ -67,7 +67,8 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
     count, indenters, motion, surface, history, lists, slid, points, slot, diagonal, room, (nodal, covered, together) = contact
     given, plain, origin = vectors
     operator = inner[OPERATOR]
-    strict = 1.0 if tolerance >= LOOSE else STRICT
+    exact = tolerance < LOOSE
+    strict = STRICT if exact else 1.0
     iterations, lost, goal, share, ended, ended_before = 0, 0.0, 0.0, 0.0, False, False
     for attempt in range(-1, most):  # before the first solution, points are linearized about the velocity as it is
         if attempt >= 0:
@@ -76,7 +77,7 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
                 change_contacts(data, given, -1.0)
             forget_impulses(operator, given)
             if not attempt:
-                floor = plain_residual(data, plain, origin)
+                floor = plain_residual(data, plain, origin, exact)
             assemble(count, step, surface, lists, points[0], given, operator, room[4])
             close_operator(operator, smoother, slot, diagonal)
             follow_contacts(inner[8], smoother, data[0][6], (operator[0], operator[1], operator[5][FACES]), iterations)
@@ -84,12 +85,13 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
             if not attempt:
                 goal, share = extrapolate(data, ahead, tolerance, floor)
             rough = ROUGHLY**2 * residual_norm(r, smoother, data[0][6])
-            ended = tolerance < LOOSE or rough <= goal or attempt >= min(ROUGH_PASSES, most - 1)
-            if ended:
+            ended = exact or rough <= goal or attempt >= min(ROUGH_PASSES, most - 1)
+            if exact:
                 iterations += solve_exactly(data, goal, limit, given, plain, origin)
-                lost = settle_in_contact(data)
             else:
-                iterations += solve_roughly(data[0], rough, limit)
+                iterations += solve_roughly(data[0], goal if ended else rough, limit)
+            if ended:
+                lost = settle_in_contact(data)
         if attempt > 0 and not ended_before:  # what begins to slip is not decided by a rough solution
             _slid_before(count, surface, history, lists, slid)
         begins, ended_before = attempt < 0, ended
@@ -104,10 +106,10 @@ def _settle(engine, contact, vectors, ahead, smoother, most):  # type: ignore[no
     return iterations, most, lost, False, share
 
 
-@njit(cache=True)
-def _move_indenters(axes, centres, velocity, spin, step, traction, first):  # type: ignore[no-untyped-def]  # pragma: no cover
+@njit(cache=True, **UNCOUNTED)
+def _move_indenters(axes, centres, velocity, spin, step, traction, first, room):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Move and turn indenters by a step, and the friction at their points with them."""
-    unit, turn, old = np.empty(3), np.empty((3, 3)), np.empty(3)
+    _, _, (unit, old, _, _, _, _), _, turn = room
     for q in range(len(centres)):
         rate = np.sqrt(spin[q, 0] ** 2 + spin[q, 1] ** 2 + spin[q, 2] ** 2)
         for a in range(3):
@@ -128,7 +130,7 @@ def _move_indenters(axes, centres, velocity, spin, step, traction, first):  # ty
                 _turn(turn, traction[p], old)
 
 
-@njit(cache=True)
+@njit(cache=True, **UNCOUNTED)
 def _turn(turn, vector, old):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Turn a vector (3,) by a rotation (3, 3); `old` is scratch."""
     for a in range(3):
@@ -137,7 +139,7 @@ def _turn(turn, vector, old):  # type: ignore[no-untyped-def]  # pragma: no cove
         vector[a] = turn[a, 0] * old[0] + turn[a, 1] * old[1] + turn[a, 2] * old[2]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, **UNCOUNTED)
 def contact_steps(data, contact, weight, motion, solver, reactions, most):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take len(velocity) steps in contact; state, `history`, axes and centres are changed, reactions filled.
 
@@ -146,24 +148,24 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
     stiffer (k, 2) of the indenters; nodes of the faces (f, 4), inverse areas (f, 4), foundation (f, 4), shape functions (q, 4) and weights
     (p,) at the points, and where points (k + 1,) and shape functions (k + 1,) of each indenter begin; the arrays of `ContactState`; what
     `near_faces` lists, linearizations and what they exert, which points slide, slots of the nodes, their diagonal blocks, numbers of the
-    nodes (COLUMNS, k, n), how far they are covered (k, n), whether multipliers are found with the end of the step, the mean acceleration in
-    the step before (3, n) and how much of it lasted (1,), which are changed; room for four vectors (3 pad,); and, of explicit steps, whose
-    `data` are those of the masses alone under external forces that are set in every step, what `forces_of_elements` takes: blocks, tables,
-    extensions and external forces; else empty. Constrained components of `data` move by their weights times the velocities of their
-    bodies; `motion` are these (steps, bodies, 3), and velocities and angular velocities of the indenters (steps, k, 3); `solver` the limits
-    of the solver; `reactions` those of the bodies and of the indenters; `most` the most passes.
+    nodes (COLUMNS, k, n), room for what is small, how far they are covered (k, n), whether multipliers are found with the end of the step,
+    the mean acceleration in the step before (3, n) and how much of it lasted (1,), which are changed; room for four vectors (3 pad,); and,
+    of explicit steps, whose `data` are those of the masses alone under external forces that are set in every step, what
+    `forces_of_elements` takes: blocks, tables, extensions and external forces; else empty. Constrained components of `data` move by their
+    weights times the velocities of their bodies; `motion` are these (steps, bodies, 3), and velocities and angular velocities of the
+    indenters (steps, k, 3); `solver` the limits of the solver; `reactions` those of the bodies and of the indenters; `most` the most
+    passes.
     Returns iterations, passes and the steps whose contacts did not settle.
     """
     (_, _, mass, v, work, inner, now), (x, _, _, before, base, external, step) = data
     indenters, surface, history, scratch, (change, given, plain, origin), (blocks, tables, extension, applied) = contact
     (_, axes), centres, _, _, _ = indenters
     held_velocity, velocity, spin = motion
-    lists, points, slid, slot, diagonal, nodal, covered, together, trend, trust = scratch
+    lists, points, slid, slot, diagonal, nodal, room, covered, together, trend, trust = scratch
     operator, first = inner[OPERATOR], surface[5]
     change[:], given[:] = 0.0, 0.0
     pad = len(mass)
     iterations, passes, unsettled = 0, 0, 0
-    room = new_room()
     begin_with(inner, now)
     control = inner[POOL][0]
     for n in range(len(velocity)):
@@ -179,9 +181,9 @@ def contact_steps(data, contact, weight, motion, solver, reactions, most):  # ty
                 along += now[1][h, a] * held_velocity[n, now[3][h], a]
             now[2][h] = weight[h] * along
         moving = (velocity[n], spin[n])
-        _move_indenters(axes, centres, velocity[n], spin[n], step, history[4], first)
-        count = near_faces(x, v, step, indenters, moving, surface, lists)
-        pull_off(count, x, v, step, mass, indenters, moving, surface, history, lists, base, reactions[1][n])
+        _move_indenters(axes, centres, velocity[n], spin[n], step, history[4], first, room)
+        count = near_faces(x, v, step, indenters, moving, surface, lists, room)
+        pull_off(count, x, v, step, mass, indenters, moving, surface, history, lists, base, reactions[1][n], room)
         add_momenta(mass, v, 1.0, base)
         _slid_before(count, surface, history, lists, slid)
         found = (count, indenters, moving, surface, history, lists, slid, points, slot, diagonal, room, (nodal, covered, together))

@@ -14,9 +14,11 @@ stays symmetric and positive; where friction turns a point round, it is taken as
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import (
     BOX,
     CYLINDER,
@@ -47,24 +49,24 @@ NORMAL, PRESSURE, FRICTION, STIFF, DRAG, SURFACE, ACTIVE, ALIGNED, SLACK, TURNED
 FORCE, TANGENT, ALONG, TOUCHING, OWN, UNDER, BORNE, RESULTS = 0, 3, 6, 7, 8, 9, 10, 11
 
 
-@njit(cache=True, **COUNTED)
-def near_faces(x, v, step, indenters, motion, surface, lists):  # type: ignore[no-untyped-def]  # pragma: no cover
+@njit(cache=True, **UNCOUNTED)
+def near_faces(x, v, step, indenters, motion, surface, lists, room):  # type: ignore[no-untyped-def]  # pragma: no cover
     """List the faces that indenters may touch in this step, or that still hold what they left there; return how many there are.
 
     `x` are the positions before the step, from where nodes go on with v; `lists` indenter and face of every entry, clearances (k, f), how
-    far things moved since these were found (k,), and which faces hold something (k, f).
+    far things moved since these were found (k,), and which faces hold something (k, f); `room` is that of `new_room`.
     """
     (geometry, axes), centres, _, _, _ = indenters
     velocity, spin = motion
     corners = surface[0]
     body, face, clear, moved, live = lists
+    _, _, (c, _, d, q, _, n), none, _ = room
     pad, count = len(x) // 3, 0
     fastest = 0.0
     for i in range(pad):
         fastest = max(fastest, v[i] ** 2 + v[pad + i] ** 2 + v[2 * pad + i] ** 2)
     for k in range(len(centres)):
         fastest = max(fastest, velocity[k, 0] ** 2 + velocity[k, 1] ** 2 + velocity[k, 2] ** 2)
-    c, d, q, n, none = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((0, 0))
     for k in range(len(centres)):
         turns = spin[k, 0] != 0.0 or spin[k, 1] != 0.0 or spin[k, 2] != 0.0
         moved[k] = 0.0 if turns else moved[k] + 2.0 * step * np.sqrt(fastest)
@@ -132,15 +134,29 @@ def _gather(x, v, step, nodes, at, speed):  # type: ignore[no-untyped-def]  # pr
 
 
 @njit(cache=True, **UNCOUNTED)
+def _relate(at, centre):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Make positions (4, 3) relative to a centre; here as below one by one, since arithmetic of arrays takes Numba long to compile."""
+    for c in range(4):
+        for a in range(3):
+            at[c, a] -= centre[a]
+
+
+@njit(cache=True, **UNCOUNTED)
+def _clear(values, begin):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set values (n,) to zero from a place on."""
+    for k in range(begin, len(values)):
+        values[k] = 0.0
+
+
+@njit(cache=True, **UNCOUNTED)
 def _combine(shape, values, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set out (3,) to the values (4, 3) of the nodes of a face at a point with these shape functions (4,)."""
     for a in range(3):
         out[a] = shape[0] * values[0, a] + shape[1] * values[1, a] + shape[2] * values[2, a] + shape[3] * values[3, a]
 
 
-@njit(cache=True, **COUNTED)
-def new_room():  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return small arrays for `look` and `assemble`."""
+def new_room() -> tuple[Any, ...]:
+    """Return small arrays for the kernels of a step: nodes of a face, shares of these, vectors, no matrix, and a matrix."""
     nodes, vectors = np.empty((2, 4, 3)), np.empty((6, 3))
     across = (vectors[0], vectors[1], vectors[2], vectors[3], vectors[4], vectors[5])
     return (nodes[0], nodes[1]), np.empty(4), across, np.empty((0, 0)), np.empty((3, 3))
@@ -164,7 +180,7 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
         kind, size, turn, mesh, each = geometry[0][k], geometry[1][k], axes[k], mesh_of(geometry, k), rule[k + 1] - rule[k]
         rows = turn[0, 0], turn[0, 1], turn[0, 2], turn[1, 0], turn[1, 1], turn[1, 2], turn[2, 0], turn[2, 1], turn[2, 2]
         _gather(x, v, step, corners[f], at, speed)
-        at -= centres[k]
+        _relate(at, centres[k])
         for c in range(4):
             share[c] = multiplier[k, corners[f, c]]
         _face_normal(at, across)
@@ -182,11 +198,11 @@ def look(count, x, v, step, indenters, motion, surface, history, lists, slid, po
             else:
                 gap = _primitive_gap(kind, size, turn, d, q, m, n, none)
             if begins:
-                linear[p, ACTIVE:] = 0.0
+                _clear(own, ACTIVE)
             carried = shape[0] * share[0] + shape[1] * share[1] + shape[2] * share[2] + shape[3] * share[3]
             if linear[p, ACTIVE] == 0.0:
                 if found[p, TOUCHING] != 0.0:
-                    found[p] = 0.0
+                    _clear(result, 0)
                 if is_far(gap - carried / stiff, np.sqrt(weight), form[k, 0]):
                     found[p, UNDER], found[p, BORNE] = 0.0, 0.0
                     continue
@@ -278,7 +294,7 @@ def rest_at(x, indenters, surface, begun, history):  # type: ignore[no-untyped-d
         mesh, each = mesh_of(geometry, k), rule[k + 1] - rule[k]
         for f in range(len(corners)):
             _gather(x, x, 0.0, corners[f], at, speed)
-            at -= centres[k]
+            _relate(at, centres[k])
             _face_normal(at, across)
             for g in range(each):
                 p = first[k] + f * each + g

@@ -1,7 +1,8 @@
 """Velocities of a step in contact whose contacts change from pass to pass.
 
-A pass that may not be the last one ends early, with the residual that conjugate gradients in single precision carry along. The lattice
-is multiplied in double precision once, at the end: by what all passes changed.
+Passes end with the residual that conjugate gradients in single precision carry along, and what these take out of products along
+constrained components is counted, so that the residual tells reactions as well. Only where the tolerance is tight is the lattice multiplied
+in double precision, at the end of each pass: by what all passes changed. Beside a loose one, that adds nothing.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from naibu.mechanics.lattices.cpu.implicit._solver_parts import (
     POOL,
     collect,
     share,
+    take_out_part,
 )
 
 _FAST, _SUMS = {"contract", "nsz"}, {"contract", "nsz", "reassoc"}
@@ -31,16 +33,17 @@ _ROUNDS = 8  # of conjugate gradients, at most, between which the residual is co
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)
-def plain_residual(data, plain, origin):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Constrain v; keep it in `origin`, and its residual without contact in `plain`, both (3 pad,).
+def plain_residual(data, plain, origin, kept):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Constrain v; if `kept`, put it in `origin`, and its residual without contact in `plain`, both (3 pad,).
 
     Returns the square of the norm below which rounding rules.
     """
     v, r, counts = data[0][3], data[0][4][1], data[0][5][OPERATOR][5]
     counts[FACES], counts[NODES] = 0, 0
     floor = first_residual(data)
-    for i in range(len(v)):
-        plain[i], origin[i] = r[i], v[i]
+    if kept:
+        for i in range(len(v)):
+            plain[i], origin[i] = r[i], v[i]
     return floor
 
 
@@ -81,7 +84,8 @@ def extrapolate(data, ahead, tolerance, floor):  # type: ignore[no-untyped-def] 
         along[i] = change[i]
     project(constrained, along, pad)
     curvature = _product(data[0])
-    project(constrained, q, pad)
+    constrained[4][:] = 0.0
+    take_out_part(constrained, q, pad, 0, len(constrained[0]), 1.0)
     both, square = 0.0, 0.0  # r . q and q . q in the inverse of the diagonal
     work = 0.0
     for a in range(3):
@@ -93,6 +97,7 @@ def extrapolate(data, ahead, tolerance, floor):  # type: ignore[no-untyped-def] 
     norm = residual_norm(r, smoother, constrained) + taken * (2.0 * both + taken * square)
     portion = taken + work / curvature if curvature > 0.0 else 0.0
     _move_along(v, r, along, q, portion - taken)
+    _give_back(constrained, r, portion - taken)
     return max(tolerance**2 * norm, floor), portion
 
 
@@ -100,18 +105,25 @@ def extrapolate(data, ahead, tolerance, floor):  # type: ignore[no-untyped-def] 
 def solve_roughly(solver, goal, limit):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Improve v, whose residual is r, until the square of the residual's norm is below `goal`, in single precision.
 
-    Leaves in r the free part of the residual, as conjugate gradients carry it along. Returns the number of iterations.
+    Leaves in r the residual as conjugate gradients carry it along. Returns the number of iterations.
     """
-    v, r, inner = solver[3], solver[4][1], solver[5]
+    v, r, inner, constrained = solver[3], solver[4][1], solver[5], solver[6]
     w, rough, memory = inner[4], inner[5], inner[8][5][2]
     norm = share(solver, NORM, 0.0)
     if not norm > goal:
         return 0
     unit = np.sqrt(norm)
     count, _ = conjugate_gradients(solver, unit, max(0.9 * goal / norm, 1e-10), limit, len(memory) > 0)
+    node, direction, _, _, taken = constrained
+    pad = len(v) // 3
+    for h in range(len(node)):  # these components of r are not in the residual of conjugate gradients either
+        i = node[h]
+        along = direction[h, 0] * r[i] + direction[h, 1] * r[pad + i] + direction[h, 2] * r[2 * pad + i]
+        taken[h] -= along / unit
     for i in range(len(v)):
         v[i] += unit * w[i]
         r[i] = unit * rough[i]
+    _give_back(constrained, r, unit)
     if len(memory):
         memory[CREDIT] += count
     return count
@@ -169,6 +181,16 @@ def _product(solver):  # type: ignore[no-untyped-def]  # pragma: no cover
             for i in range(axis * pad + nodes[c], axis * pad + nodes[c + 1]):
                 rows[0, i] = rows[c, i]
     return curvature
+
+
+@njit(cache=True, fastmath=_FAST, **UNCOUNTED)
+def _give_back(constrained, r, fraction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Take from a residual r, times a fraction, what was taken out along constrained components."""
+    node, direction, _, _, taken = constrained
+    pad = len(r) // 3
+    for h in range(len(node)):
+        for a in range(3):
+            r[a * pad + node[h]] -= fraction * taken[h] * direction[h, a]
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)

@@ -18,12 +18,12 @@ from naibu.mechanics.lattices.cpu._contact_kernels import contact_steps
 from naibu.mechanics.lattices.cpu._contact_multipliers import COLUMNS
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 from naibu.mechanics.lattices.cpu._contact_points import COLUMNS as POINT_COLUMNS
-from naibu.mechanics.lattices.cpu._contact_points import RESULTS, rest_at
+from naibu.mechanics.lattices.cpu._contact_points import RESULTS, new_room, rest_at
 from naibu.mechanics.lattices.cpu.explicit_contact import ElementForces, no_elements
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, TOUCHED
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import COARSE, POOL
 from naibu.mechanics.lattices.cpu.implicit._step_parts import implicit_worker
-from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments, solver_entries
 from naibu.mechanics.lattices.cpu.stepper import IMPLICIT_CALL, MOST_ITERATIONS, ImplicitStepper, calls
 from naibu.mechanics.lattices.model.contact_state import ContactState
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface
@@ -200,7 +200,7 @@ class ContactStepper:
         if base is self.base:
             return base.contact_arguments(operator)
         (node, direction, weight, body), pool = base.constrained, base.scratch[1][POOL]
-        return base.arguments(pool, operator, (node, direction, np.zeros(len(node)), body)), weight, pool[0]
+        return base.arguments(pool, operator, solver_entries(node, direction, body)), weight, pool[0]
 
     def close(self) -> None:
         """Stop the workers, until the next step."""
@@ -257,7 +257,7 @@ def _scratch(faces: int, indenters: int, points: int, pad: int) -> KernelTuple:
     slots = min(4 * faces, pad)
     operator = new_operator(pairs, slots)
     nodal = (np.full(pad, -1, np.int64), np.zeros((slots, 3, 3)), np.zeros((COLUMNS, indenters, pad)))
-    return operator, lists, exerted, np.zeros(points, np.bool_), *nodal
+    return operator, lists, exerted, np.zeros(points, np.bool_), *nodal, new_room()
 
 
 @dataclass(slots=True, eq=False)

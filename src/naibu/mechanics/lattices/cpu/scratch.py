@@ -11,7 +11,7 @@ import numpy as np
 
 from naibu._numba.intrinsics.simd import WIDTH, aligned
 from naibu._numba.thread_pool import new_control
-from naibu.core.arrays import AnyArray, AnyFloatArray, FloatArray
+from naibu.core.arrays import AnyArray, AnyFloatArray, FloatArray, IntArray
 from naibu.mechanics.lattices.cpu._contact_operator import new_operator
 
 KernelTuple = tuple[Any, ...]  # arrays and numbers as kernels take them, in nested tuples, whose types Numba works out
@@ -80,6 +80,11 @@ class ScratchPool:
         """Begin without any set."""
         self.table, self.light, self.smoother, self.coarse, self.places = state
         self._spare = []
+
+
+def solver_entries(node: IntArray, direction: FloatArray, body: IntArray) -> KernelTuple:
+    """Return constrained components as the solver takes them: with their speeds, and what it took of products along them."""
+    return node, direction, np.zeros(len(node)), body, np.zeros(len(node))
 
 
 def new_sums(parts: int) -> tuple[FloatArray, FloatArray]:

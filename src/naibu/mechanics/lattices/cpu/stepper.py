@@ -16,7 +16,7 @@ from naibu.mechanics.lattices.cpu._explicit_kernels import explicit_steps, expli
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import implicit_steps
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import OPERATOR, POOL
 from naibu.mechanics.lattices.cpu.implicit._step_parts import implicit_worker
-from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments, Scratch, new_sums
+from naibu.mechanics.lattices.cpu.scratch import KernelTuple, PackedArguments, Scratch, new_sums, solver_entries
 
 MOST_ITERATIONS = 20_000
 _EXPLICIT_CALL, IMPLICIT_CALL = 64, 8  # steps of a call of a kernel with workers
@@ -137,7 +137,7 @@ class ImplicitStepper(Stepper):
             rows = tuple(aligned((count, len(self.position)), kind) for kind in (np.float64, np.float32))
             pool = (new_control(count), (cuts, nodes, high, np.searchsorted(own[0], nodes)), *rows, *new_sums(count))
         self.control, self._pool, self._weight = pool[0], pool, own[2]
-        self._entries = (own[0], own[1], np.zeros(len(own[0])), own[3])
+        self._entries = solver_entries(own[0], own[1], own[3])
         self.data = self.arguments(pool, inner[OPERATOR], self._entries)
         if count > 1:  # returns at once, compiled, lest workers compile while steps wait
             stop_workers(self.control)

@@ -23,7 +23,7 @@ from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import add_momenta, add_reactions, advance, new_velocity
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import multiply, residual_norm, solve
 from naibu.mechanics.lattices.cpu.implicit._step_parts import constrain_part
-from naibu.mechanics.lattices.cpu.scratch import PackedArguments, Scratch
+from naibu.mechanics.lattices.cpu.scratch import PackedArguments, Scratch, solver_entries
 from naibu.mechanics.lattices.model.coefficients import implicit_coefficients
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState, checked_velocity, require_constrained, require_numbers
@@ -183,8 +183,8 @@ def _arguments(
     The latter have a velocity of their own, and constrained nodes that stand still.
     """
     (blocks, tables), (work, inner), (x, v, y, lengths) = engine.kernel, scratch, state
-    node, direction, body = (np.ascontiguousarray(a) for a in (constrained.node, constrained.direction, constrained.body))
-    now, still = ((node, direction, np.zeros(len(node)), body) for _ in range(2))
+    held = np.ascontiguousarray(constrained.node), np.ascontiguousarray(constrained.direction), np.ascontiguousarray(constrained.body)
+    now, still = solver_entries(*held), solver_entries(*held)
     change, before, right = (aligned(v.shape, float) for _ in range(3))
     data = packed((blocks, tables, engine.mass, v, work, inner, now), (x, y, lengths, before, right, np.zeros(0), engine.step))
     return data, packed(blocks, tables, engine.mass, change, work, inner, still)
@@ -308,7 +308,7 @@ def _driven_steps(  # type: ignore[no-untyped-def]  # pragma: no cover
     first, second, rows = blocks
     axes, r, _, q = work
     own, pad = (tables[1], tables[2], tables[3], tables[5]), len(mass)
-    _, direction, speed, constrained_by = now
+    _, direction, speed, constrained_by, _ = now
     begin_with(inner, now)
     for n in range(len(velocity)):
         _begin(v, loads, force[n], pad, step, before, right)

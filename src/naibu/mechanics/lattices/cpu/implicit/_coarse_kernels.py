@@ -309,7 +309,8 @@ def follow_contacts(coarse, smoother, constrained, operator, work):  # type: ign
         least += min(shares[1, h], shares[0, h])
     if dear and not (state[TOUCHED] and changed <= CHANGED * least):
         build(coarse, smoother, constrained, operator, CONTACT)
-        shares[0] = shares[1]
+        for h in range(shares.shape[1]):
+            shares[0, h] = shares[1, h]
         state[TOUCHED] = 1
     state[SLOT] = CONTACT if state[TOUCHED] else PLAIN
 

@@ -160,7 +160,7 @@ def improved_velocity(data, goal, limit):  # type: ignore[no-untyped-def]  # pra
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)
 def add_reactions(constrained, r, pad, step, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Add to `reaction` (bodies, 3) the forces, mN, by which bodies constrain nodes, from the residual r of a step."""
-    node, direction, _, body = constrained
+    node, direction, _, body, _ = constrained
     for h in range(len(node)):
         i = node[h]
         along = (direction[h, 0] * r[i] + direction[h, 1] * r[pad + i] + direction[h, 2] * r[2 * pad + i]) / step
@@ -198,7 +198,7 @@ def implicit_steps(data, weight, velocity, limits, reaction):  # type: ignore[no
     """
     solver, step = data[0], data[1][6]
     mass, r, inner, now = solver[2], solver[4][1], solver[5], solver[6]
-    _, direction, speed, body = now
+    _, direction, speed, body, _ = now
     control = inner[POOL][0]
     iterations, checked = 0, 0
     begin_with(inner, now)
