@@ -6,13 +6,15 @@
     python benchmarks/field_identification.py coverage --repetitions 30    # errors and intervals, data of other code; five minutes
     python benchmarks/field_identification.py tetrahedra --repetitions 30  # the same on tetrahedra
     python benchmarks/field_identification.py surface --repetitions 30     # as `coverage`, forces on the whole surface unknown
+    python benchmarks/field_identification.py lumps --repetitions 2        # maps of soft and stiff lumps, and of none; data of other code
     python benchmarks/field_identification.py --seeds 5 --repetitions 20   # shorter
 
 Noise is normal, independent at every point, and given as a fraction of the largest displacement of its load case. `elements`, `regions` and
 `unseen` measure the nodes of the mesh that made the data and use its elements as given, as the report does: they show what noise does, and
 nothing of the errors of elements. `inclusion` and `large` measure a grid of points in a body that was solved on a finer mesh; `coverage`,
-`tetrahedra` and `surface`, random points in bodies that were solved by other code. Every row ends with the goal and whether it was met.
-`coverage --record` writes ``results/field_identification.json``, `surface --record` ``results/field_identification_surface.json``.
+`tetrahedra`, `surface` and `lumps`, random points in bodies that were solved by other code. Every row ends with the goal and whether
+it was met. `--record` writes the tables of `coverage`, `surface` and `lumps` to ``results/field_identification.json`` and
+``results/field_identification_surface.json`` and ``results/field_identification_lumps.json``.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 from records import ResultTable, write_record
+from scipy.spatial import cKDTree
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
@@ -35,6 +38,7 @@ from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import logarithms, young_and_poisson
 from naibu.identification.from_fields.inversion.regularization import cell_volumes
+from naibu.identification.from_fields.regions.relative_map import identify_relative_map
 from naibu.identification.from_fields.uncertainty import cramer_rao_bound
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
@@ -43,7 +47,7 @@ from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_nodes
 from naibu.reproduction.chapter3.bodies import LAYERS, PushedBody, cube
-from naibu.validation.specimens.quadratic_body import SHAPES, QuadraticBody
+from naibu.validation.specimens.quadratic_body import SHAPES, SIDE_MM, UNKNOWN, Inclusion, QuadraticBody
 
 Array = NDArray[np.float64]
 _TOP = np.stack([np.tile(np.linspace(0.0, 40.0, 5), 5), np.repeat(np.linspace(0.0, 40.0, 5), 5)], axis=1)
@@ -293,11 +297,55 @@ def covered(name: str, cell_type: str, cells: int, draws: int, *, whole_surface:
     return (name, cell_type, cells, *errors, f"{int(of_young.sum())} of {draws}", f"{int(of_poisson.sum())} of {draws}")
 
 
+LUMPS = ((0.3, 13.0), (0.5, 13.0), (2.0, 13.0), (5.0, 13.0), (5.0, 9.0), (1.0, 0.0))  # contrast, diameter, mm
+MIDDLE = (22.0, 18.0, 21.0)  # of a lump, mm
+
+
+def lumps(seeds: int, repetitions: int) -> ResultTable:
+    """Maps of a cube of 40 mm that is pressed by a tenth between two plates, with a lump or none, nothing known; 1500 points, noise 1 %."""
+    print(f"\n(g) maps of a cube with a lump, solved by other code (27-node hexahedra), 1500 points, noise 1 %; {repetitions} draws each")
+    rows = [_lump(contrast, diameter, draw) for contrast, diameter in LUMPS for draw in range(repetitions)]
+    columns = ("contrast", "diameter, mm", "draw", "regions", "Dice", "contrast found", "95 % from", "to", "first sentence")
+    return ResultTable("lumps", columns, tuple(rows))
+
+
+def _lump(contrast: float, diameter: float, draw: int) -> tuple[str | float | int, ...]:
+    """Print and return a row of `lumps`; Dice's coefficient and contrast are those of the region that has most of the lump."""
+    young, poisson = UNKNOWN
+    lump = Inclusion(MIDDLE, 0.5 * diameter, contrast * young, poisson)
+    solved = QuadraticBody("cube", known=UNKNOWN, inclusions=(lump,)).solved((0.0, 0.0, -4.0), divisions=12)
+    mesh, loaded = QuadraticBody("cube").model(10, "hexahedron")
+    rng, start = np.random.default_rng(draw), time.process_time()
+    points, u = solved.at(rng.uniform(0.02, 0.98, (1500, 3)))
+    sd = 0.01 * float(np.linalg.norm(u, axis=1).max())
+    field = DisplacementField.from_arrays(points, u + sd * rng.standard_normal(u.shape), sd_mm=sd)
+    found = identify_relative_map(mesh, [FieldLoadCase.of("push", field, mesh, loaded=loaded)], law="linear")
+    middles = mesh.points[mesh.cells].mean(axis=1)
+    axis = np.arange(0.5, SIDE_MM)
+    grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+    region = found.zones.of_cell[cKDTree(middles).query(grid)[1]]
+    region, true = region if found.borders is None else found.borders.region_at(grid, region), lump.holds(grid)
+    best, dice = 0, 0.0
+    if found.zones.count > 1 and true.any():
+        shares = [2.0 * float((true & (region == k)).sum()) / float(true.sum() + (region == k).sum()) for k in range(found.zones.count)]
+        best, dice = int(np.argmax(shares)), max(shares)
+    low, high = (1.0, 1.0) if found.uncertainty is None else found.intervals()[0][best]
+    held = dice == 0.0 or low <= contrast <= high
+    sentence = found.identifiability[0].partition(":")[0]
+    row(
+        f"contrast {contrast:g}, {diameter:g} mm, draw {draw}: {found.zones.count} regions, Dice {dice:.2f}, contrast "
+        f"{found.young_modulus[best]:.3g} [{low:.3g}, {high:.3g}], {time.process_time() - start:.0f} s: {sentence}",
+        bool(held and (diameter > 0.0 or found.zones.count == 1)),
+    )
+    values = (float(f"{v:.3g}") if np.isfinite(v) else "not known" for v in (found.young_modulus[best], low, high))
+    return (contrast, diameter, draw, found.zones.count, round(dice, 2), *values, sentence)
+
+
 STUDIES: dict[str, Callable[[int, int], ResultTable | None]] = {
     "elements": elements, "regions": regions, "unseen": unseen, "inclusion": inclusion, "large": large, "coverage": coverage,
-    "tetrahedra": tetrahedra, "surface": surface,
+    "tetrahedra": tetrahedra, "surface": surface, "lumps": lumps,
 }  # fmt: skip
-RECORDS = {"coverage": "field_identification", "surface": "field_identification_surface"}
+RECORDS = {"coverage": "field_identification", "surface": "field_identification_surface", "lumps": "field_identification_lumps"}
 
 
 def main() -> None:
@@ -306,7 +354,7 @@ def main() -> None:
     parser.add_argument("studies", nargs="*", help=f"any of {', '.join(STUDIES)}; all by default")
     parser.add_argument("--seeds", type=int, default=20, help="draws of noise in `elements` and `unseen`")
     parser.add_argument("--repetitions", type=int, default=100, help="draws of noise in `regions`")
-    parser.add_argument("--record", action="store_true", help="write the tables of `coverage` and `surface`")
+    parser.add_argument("--record", action="store_true", help="write the tables of `coverage`, `surface` and `lumps`")
     chosen = parser.parse_args()
     if chosen.record and not set(RECORDS) & set(chosen.studies):
         parser.error(f"--record goes with the studies {' and '.join(RECORDS)}")

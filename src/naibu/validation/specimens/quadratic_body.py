@@ -24,6 +24,19 @@ UNKNOWN, KNOWN = (5.0, 0.45), (10.0, 0.4)  # Young's modulus, kPa, and Poisson's
 _GAUSS = (np.array([-np.sqrt(0.6), 0.0, np.sqrt(0.6)]), np.array([5.0, 8.0, 5.0]) / 9.0)
 
 
+class Inclusion(NamedTuple):
+    """A sphere: its middle and radius, mm, Young's modulus, kPa, and Poisson's ratio."""
+
+    middle_mm: tuple[float, float, float]
+    radius_mm: float
+    young_modulus: float
+    poisson_ratio: float
+
+    def holds(self, points: FloatArray) -> BoolArray:
+        """Return which points (..., 3), mm, lie in it."""
+        return np.asarray(np.linalg.norm(points - self.middle_mm, axis=-1) < self.radius_mm)
+
+
 class Solved(NamedTuple):
     """Nodes (n, 3), mm, elements (m, 27) and displacement (n, 3), mm, of a body of `divisions` elements a side."""
 
@@ -51,11 +64,14 @@ class QuadraticBody:
         ``"cube"``, ``"tapered"`` (by a third, and twisted by 25 degrees) or ``"barrel"``, see `SHAPES`.
     unknown, known : (float, float)
         Young's modulus, kPa, and Poisson's ratio of the lower and of the upper half.
+    inclusions : tuple of Inclusion
+        Spheres in either half.
     """
 
     name: str
     unknown: tuple[float, float] = UNKNOWN
     known: tuple[float, float] = KNOWN
+    inclusions: tuple[Inclusion, ...] = ()
 
     def solved(self, push: ArrayLike, divisions: int = 8) -> Solved:
         """Return the equilibrium when the plate moves by `push` (3,), mm; `divisions` elements a side, even."""
@@ -64,10 +80,13 @@ class QuadraticBody:
         z, y, x = (a.ravel() for a in np.meshgrid(axis, axis, axis, indexing="ij"))
         points, cells = SHAPES[self.name](np.stack([x, y, z], axis=1)), _cells(divisions)
         upper = np.repeat(np.arange(divisions) >= divisions // 2, divisions**2)
-        lame, shear = np.where(upper[:, None], _lame(*self.known), _lame(*self.unknown)).T
+        moduli = np.repeat(np.where(upper[:, None], _lame(*self.known), _lame(*self.unknown))[:, None], 27, axis=1)
+        at = np.einsum("qa,mai->mqi", np.stack([_shape(_GAUSS[0][list(q)])[0] for q in np.ndindex(3, 3, 3)]), points[cells])
+        for one in self.inclusions:
+            moduli[one.holds(at)] = _lame(one.young_modulus, one.poisson_ratio)
         fixed = np.repeat((z < 1e-9) | (z > SIDE_MM - 1e-9), 3)
         u: FloatArray = np.where((z > 0.5 * SIDE_MM)[:, None], np.asarray(push, dtype=float), 0.0).ravel() * fixed
-        matrix = _stiffness(points, cells, lame, shear)
+        matrix = _stiffness(points, cells, *np.moveaxis(moduli, -1, 0))
         free = sp.diags((~fixed).astype(float))
         right = -(free @ (matrix @ u))
         held = sp.bsr_matrix(free @ matrix @ free + sp.diags(fixed * matrix.diagonal().mean()), blocksize=(3, 3))
@@ -121,25 +140,25 @@ def _cells(n: int) -> IntArray:
 
 
 def _stiffness(points: FloatArray, cells: IntArray, lame: FloatArray, shear: FloatArray) -> sp.csr_matrix:
-    """Return the stiffness (3 n, 3 n), mN/mm, the pressure of every element condensed."""
-    m, x = len(cells), points[cells]
+    """Return the stiffness (3 n, 3 n), mN/mm, of moduli (m, 27), kPa, at integration points, the pressure of every element condensed."""
+    m, x, bulk = len(cells), points[cells], lame + 2.0 / 3.0 * shear
     stiffness = np.zeros((m, 27, 3, 27, 3))
     mass, coupling = np.zeros((m, 4, 4)), np.zeros((m, 4, 27, 3))
-    for index in np.ndindex(3, 3, 3):
+    for q, index in enumerate(np.ndindex(3, 3, 3)):
         value, derivatives = _shape(_GAUSS[0][list(index)])
         jacobian = np.einsum("aj,mai->mij", derivatives, x)
         weight = np.linalg.det(jacobian) * np.prod(_GAUSS[1][list(index)])
         gradient = np.einsum("aj,mji->mai", derivatives, np.linalg.inv(jacobian))
         pressure = np.concatenate([np.ones((m, 1)), np.einsum("a,mai->mi", value, x) - x.mean(axis=1)], axis=1)
-        mass += np.einsum("m,mp,mr->mpr", weight, pressure, pressure)
+        mass += np.einsum("m,mp,mr->mpr", weight / bulk[:, q], pressure, pressure)
         coupling += np.einsum("m,mp,mai->mpai", weight, pressure, gradient)
-        scaled = (weight * shear)[:, None, None] * gradient
+        scaled = (weight * shear[:, q])[:, None, None] * gradient
         stiffness += np.einsum("maj,mbi->maibj", scaled, gradient) - 2.0 / 3.0 * np.einsum("mai,mbj->maibj", scaled, gradient)
         like = np.einsum("mac,mbc->mab", scaled, gradient)
         for i in range(3):
             stiffness[:, :, i, :, i] += like
     solved = np.linalg.solve(mass, coupling.reshape(m, 4, 81)).reshape(coupling.shape)
-    stiffness += np.einsum("m,mpai,mpbj->maibj", lame + 2.0 / 3.0 * shear, coupling, solved, optimize=True)
+    stiffness += np.einsum("mpai,mpbj->maibj", coupling, solved, optimize=True)
     unknowns = (cells[:, :, None] * 3 + np.arange(3)).reshape(m, -1)
     index = np.repeat(unknowns, 81, axis=1).ravel(), np.tile(unknowns, (1, 81)).ravel()
     return sp.csr_matrix((stiffness.ravel(), index), shape=(3 * len(points),) * 2)
