@@ -311,7 +311,7 @@ class InteractiveSimulation:
     def advance(self) -> Frame:
         """Take the steps of one frame, and return it; a step that fails is taken back, and the frame says why.
 
-        Where the next one fails too, the body is stopped where it was, and the frame says so. Where that does not help either, nothing would
+        Where the next one fails too, the body is stopped where it was, and the frame says so. Where that does not help, nothing would
         move again: the body begins anew from its shape at rest, with its cuts and the tool where it waits, and the frame says so.
         A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was when the step began.
         """
