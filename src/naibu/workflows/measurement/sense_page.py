@@ -107,7 +107,8 @@ def _box(mask: BoolArray, margin: int = 4) -> tuple[slice, ...]:
 
 def _sentences(run: SenseRun) -> list[str]:
     f = run.figures
-    folds = isinstance(f["folded_fraction"], float) and f["folded_fraction"] > 0.0
+    folded = f["folded_fraction"] if isinstance(f["folded_fraction"], float) else 0.0
+    folds = folded > 0.0
     share, doubts = f["measured_fraction"], folds + len(run.measured.warnings)
     where = f"{100.0 * share:.1f} % of the object" if isinstance(share, float) and share < 0.995 else "the whole object"
     reserved = (
@@ -127,14 +128,13 @@ def _sentences(run: SenseRun) -> list[str]:
         )
     else:
         sentences.append("This method states no uncertainty.")
-    if isinstance(f["measured_fraction"], float) and f["measured_fraction"] < 0.995:
+    if isinstance(share, float) and share < 0.995:
         sentences.append(
-            f"The displacement of {100.0 * (1.0 - f['measured_fraction']):.1f} % of the object was not measured: that part lies outside "
-            "one of the "
+            f"The displacement of {100.0 * (1.0 - share):.1f} % of the object was not measured: that part lies outside one of the "
             "scans, or in its padding, or the scans show no common texture there."
         )
     if folds:
-        sentences.append(f"The field folds at {100.0 * f['folded_fraction']:.2f} % of the voxels: it is wrong there.")
+        sentences.append(f"The field folds at {100.0 * folded:.2f} % of the voxels: it is wrong there.")
     return sentences + [text.replace("`", "") for text in run.measured.warnings]
 
 

@@ -107,7 +107,10 @@ def inner_faces(mesh: Mesh) -> tuple[IntArray, FloatArray]:
 class Regularization(Protocol):
     """A penalty on theta = (ln mu of all zones, ln(kappa / mu) of all zones)."""
 
-    name: str
+    @property
+    def name(self) -> str:
+        """Of the penalty, for reports."""
+        ...
 
     def value(self, theta: FloatArray) -> float:
         """Return the penalty."""
