@@ -77,7 +77,7 @@ def judged(judged: Verdict, free: FreeLaw | None, zones: Zones, theta: FloatArra
 
 def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray) -> str:
     """Say that fields ask for another law under which a modulus would be another one by much; empty if they do not."""
-    if free is None or not free.found:
+    if free is None or not free.found or not free.probabilities:
         return ""
     law, probability = min(free.probabilities.items(), key=lambda one: one[1])
     change = np.log(young_and_poisson(theta + free.shift)[0] / young_and_poisson(theta)[0])
