@@ -280,8 +280,9 @@ def covered(name: str, cell_type: str, cells: int, draws: int, *, whole_surface:
         found = identify_field(mesh, [FieldLoadCase.of("push", field, mesh, loaded=loaded)], zones)
         young, poisson = found.intervals(law_exact=True)  # the bodies obey the law that is assumed
         assert found.uncertainty is not None
+        sd = found.uncertainty.if_law_exact.of_young_and_poisson(found.theta)[0][0]
         held = [bool(low < truth < high) for (low, high), truth in zip((young[0], poisson[0]), body.unknown, strict=True)]
-        rows.append((np.log(found.young_modulus[0] / body.unknown[0]), found.uncertainty.if_law_exact.of_young_and_poisson(found.theta)[0][0], *held))
+        rows.append((np.log(found.young_modulus[0] / body.unknown[0]), sd, *held))
     error, stated, of_young, of_poisson = np.array(rows, dtype=float).T
     bias, rms, inside = error.mean(), np.sqrt(np.mean(error**2)), of_young.mean() >= 0.9
     row(

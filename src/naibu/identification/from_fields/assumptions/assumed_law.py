@@ -21,7 +21,8 @@ UNLIKELY = 1e-3  # probability of so large a score by chance, below which fields
 MODULUS = 0.1  # change of the logarithm of a modulus from which on it matters
 DOES_NOT_FIT = "the law does not fit"
 HANGS_ON_LAW = "moduli hang on the assumed law"
-NOT_SOUGHT = "moduli may hang on the assumed law, as no equilibrium was found with its shape sought as well"
+NOT_SOUGHT = "moduli may hang on the assumed law, whose shape could not be sought as well"
+MOST_ZONES = 40  # whose laws are sought: four columns each as long as the displacement
 OF_MAP = "The map takes the law for right at strains of {:.2g} per cent: what stiffens with strain looks like another modulus."
 LISTED = 2
 
@@ -45,7 +46,7 @@ def with_law_free(
 ) -> tuple[FreeLaw | None, LawPart | None]:
     """Return moduli with the shape of the law sought as well, from the best fit, and what that means for their uncertainty.
 
-    None where strains are too small for that to matter; no uncertainty either where no equilibrium was found.
+    None where strains are too small for that to matter; no uncertainty either where there are many zones, or no equilibrium was found.
 
     Parameters
     ----------
@@ -60,6 +61,8 @@ def with_law_free(
     """
     if largest_strain(at.model, at.point.states) < LEAST_STRAIN:
         return None, None
+    if at.model.zones.count > MOST_ZONES:
+        return FreeLaw.lost(at.model.zones.names, len(at.point.theta)), None
     pairs = zip(at.model.observed, at.point.states, strict=True)
     here = [o.residual(u) for o, u in pairs]
     free = free_law(at, None if residuals is None else [r - h for r, h in zip(residuals, here, strict=True)], freedom)
