@@ -10,9 +10,10 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.assumptions.free_law import FreeLaw, free_law
+from naibu.identification.from_fields.assumptions.other_assumptions import holds
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, young_and_poisson
-from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law
+from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law, intervals
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.elements import elements
 
@@ -46,7 +47,8 @@ def with_law_free(
 ) -> tuple[FreeLaw | None, LawPart | None]:
     """Return moduli with the shape of the law sought as well, from the best fit, and what that means for their uncertainty.
 
-    None where strains are too small for that to matter; no uncertainty either where there are many zones, or no equilibrium was found.
+    None where strains are too small for that to matter; no uncertainty either where there are many zones, no equilibrium was found, or
+    small strain was assumed: who asks for that at large strain gets its interval, and the verdict says what hangs on it.
 
     Parameters
     ----------
@@ -66,7 +68,9 @@ def with_law_free(
     pairs = zip(at.model.observed, at.point.states, strict=True)
     here = [o.residual(u) for o, u in pairs]
     free = free_law(at, None if residuals is None else [r - h for r, h in zip(residuals, here, strict=True)], freedom)
-    return free, LawPart(stretch * free.shift, free.covariance * np.outer(stretch, stretch)) if free.found else None
+    if not free.found or at.model.law.linear:
+        return free, None
+    return free, LawPart(stretch * free.shift, free.covariance * np.outer(stretch, stretch))
 
 
 def judged(judged: Verdict, free: FreeLaw | None, zones: Zones, theta: FloatArray, total: Uncertainty) -> tuple[Verdict, str]:
@@ -103,7 +107,12 @@ def hangs_on_law(judged: Verdict, free: FreeLaw | None, total: Uncertainty, thet
         return ""
     if not free.found:
         return NOT_SOUGHT
-    return HANGS_ON_LAW if by_law(total, theta).any() else ""
+    if total.law is None:
+        bounds, other = intervals(theta, total)[0], young_and_poisson(theta + free.shift)[0]
+        hangs = any(not holds(low, high, e) for e, (low, high) in zip(other, bounds, strict=True))
+    else:
+        hangs = bool(by_law(total, theta).any())
+    return HANGS_ON_LAW if hangs else ""
 
 
 def warned(strain: float, sentences: tuple[str, ...]) -> tuple[str, ...]:
