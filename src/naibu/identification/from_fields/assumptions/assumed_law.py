@@ -10,9 +10,10 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.assumptions.free_law import FreeLaw, free_law
+from naibu.identification.from_fields.assumptions.other_assumptions import holds
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, young_and_poisson
-from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law
+from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law, intervals
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.elements import elements
 
@@ -21,7 +22,8 @@ UNLIKELY = 1e-3  # probability of so large a score by chance, below which fields
 MODULUS = 0.1  # change of the logarithm of a modulus from which on it matters
 DOES_NOT_FIT = "the law does not fit"
 HANGS_ON_LAW = "moduli hang on the assumed law"
-NOT_SOUGHT = "moduli may hang on the assumed law, as no equilibrium was found with its shape sought as well"
+NOT_SOUGHT = "moduli may hang on the assumed law, whose shape could not be sought as well"
+MOST_ZONES = 40  # whose laws are sought: four columns each as long as the displacement
 OF_MAP = "The map takes the law for right at strains of {:.2g} per cent: what stiffens with strain looks like another modulus."
 LISTED = 2
 
@@ -45,7 +47,8 @@ def with_law_free(
 ) -> tuple[FreeLaw | None, LawPart | None]:
     """Return moduli with the shape of the law sought as well, from the best fit, and what that means for their uncertainty.
 
-    None where strains are too small for that to matter; no uncertainty either where no equilibrium was found.
+    None where strains are too small for that to matter; no uncertainty either where there are many zones, no equilibrium was found, or
+    small strain was assumed: who asks for that at large strain gets its interval, and the verdict says what hangs on it.
 
     Parameters
     ----------
@@ -60,10 +63,14 @@ def with_law_free(
     """
     if largest_strain(at.model, at.point.states) < LEAST_STRAIN:
         return None, None
+    if at.model.zones.count > MOST_ZONES:
+        return FreeLaw.lost(at.model.zones.names, len(at.point.theta)), None
     pairs = zip(at.model.observed, at.point.states, strict=True)
     here = [o.residual(u) for o, u in pairs]
     free = free_law(at, None if residuals is None else [r - h for r, h in zip(residuals, here, strict=True)], freedom)
-    return free, LawPart(stretch * free.shift, free.covariance * np.outer(stretch, stretch)) if free.found else None
+    if not free.found or at.model.law.linear:
+        return free, None
+    return free, LawPart(stretch * free.shift, free.covariance * np.outer(stretch, stretch))
 
 
 def judged(judged: Verdict, free: FreeLaw | None, zones: Zones, theta: FloatArray, total: Uncertainty) -> tuple[Verdict, str]:
@@ -77,7 +84,7 @@ def judged(judged: Verdict, free: FreeLaw | None, zones: Zones, theta: FloatArra
 
 def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray) -> str:
     """Say that fields ask for another law under which a modulus would be another one by much; empty if they do not."""
-    if free is None or not free.found:
+    if free is None or not free.found or not free.probabilities:
         return ""
     law, probability = min(free.probabilities.items(), key=lambda one: one[1])
     change = np.log(young_and_poisson(theta + free.shift)[0] / young_and_poisson(theta)[0])
@@ -100,7 +107,12 @@ def hangs_on_law(judged: Verdict, free: FreeLaw | None, total: Uncertainty, thet
         return ""
     if not free.found:
         return NOT_SOUGHT
-    return HANGS_ON_LAW if by_law(total, theta).any() else ""
+    if total.law is None:
+        bounds, other = intervals(theta, total)[0], young_and_poisson(theta + free.shift)[0]
+        hangs = any(not holds(low, high, e) for e, (low, high) in zip(other, bounds, strict=True))
+    else:
+        hangs = bool(by_law(total, theta).any())
+    return HANGS_ON_LAW if hangs else ""
 
 
 def warned(strain: float, sentences: tuple[str, ...]) -> tuple[str, ...]:

@@ -47,7 +47,8 @@ class FreeLaw:
     shapes, shapes_sd : ndarray, shape (g, 4)
         c01 fraction, c20 ratio, c30 ratio and isochoric part of every material, and their standard deviations.
     probabilities : dict of str to float
-        Of so large a score by chance if the law that was assumed is right, by the name of the law that was tested against it.
+        Of so large a score by chance if the law that was assumed is right, by the name of the law that was tested against it; empty where
+        that is small strain, which no law at finite strain has for a special case.
     settled : bool
         Whether the search ended where steps are short; otherwise the last step is part of the covariance.
     """
@@ -115,7 +116,7 @@ def free_law(at: Linearised, of_elements: Sequence[FloatArray] | None, freedom: 
     sd = np.sqrt(np.diag(joint.posterior(search)))[: g * N_SHAPES]
     return FreeLaw(
         tuple(materials), here.point.theta - at.point.theta, covariance, here.added[: g * N_SHAPES].reshape(g, -1), sd.reshape(g, -1),
-        {name: first.probability(search, kinds) for name, kinds in OTHER_LAWS.items()}, settled,
+        {} if at.model.law.linear else {name: first.probability(search, kinds) for name, kinds in OTHER_LAWS.items()}, settled,
     )  # fmt: skip
 
 
