@@ -40,6 +40,14 @@ const CURVE_MS = 50; // from one drawing of the curves to the next
 const UNBALANCED = 0.05; // of all forces, above which the badge says so
 const digits = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
 const CONFLICTS = new Set(["cut", "tool", "grip", "undo", "reset"]); // with a cut under way: another body comes of it, or none
+/** Gamepads that are connected; none where the page may not ask for them, as within a frame of another site. */
+const gamepads = () => {
+  try {
+    return [...(navigator.getGamepads?.() ?? [])];
+  } catch {
+    return [];
+  }
+};
 const newtons = (force) => Math.hypot(...force) / 1000;
 
 class LivePage {
@@ -292,7 +300,7 @@ class LivePage {
   }
 
   #gamepad(seconds) {
-    const pad = navigator.getGamepads?.().find(Boolean);
+    const pad = gamepads().find((one) => one?.axes);
     if (!pad) return;
     const axes = [["right", pad.axes[0]], ["up", -pad.axes[1]], ["away", -(pad.axes[3] ?? 0)]];
     axes.filter(([, value]) => Math.abs(value) > DEAD_ZONE).forEach(([axis, value]) => this.nudge(axis, PAD_SPEED * seconds * value));

@@ -142,6 +142,17 @@ def test_keys_wheel_and_gamepad_move_and_turn_the_tool(tmp_path: Path) -> None:
         still = page.value("new Promise((done) => setTimeout(() => done(naibuLive.frame.centre), 1500))")
         assert page.value("new Promise((done) => setTimeout(() => done(naibuLive.frame.centre), 500))") == still
         page.picture(tmp_path / "turned.png")
+        odd = (
+            "null",
+            "[null]",
+            "[{axes: [], buttons: []}]",
+            "[{axes: [NaN, 0.9, 0, NaN]}]",
+            "(() => { throw new Error('not allowed'); })()",
+        )
+        for pads in odd:
+            page.value(f"navigator.getGamepads = () => {pads}")
+            time_shown = page.value("naibuLive.numbers.time.textContent")
+            page.wait(f"naibuLive.numbers.time.textContent !== '{time_shown}' && !isNaN(naibuLive.frame.centre[2])", 30)
         assert page.console == []
         rotation = simulation.loop.latest()[0].tool_rotation
         np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
