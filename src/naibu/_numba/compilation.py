@@ -30,9 +30,14 @@ try:
 except Exception:  # whatever a changed interface raises
     called_kernels = None  # type: ignore[assignment]
 
+try:
+    from naibu._numba import references
+except Exception:  # whatever a changed interface raises
+    references = None  # type: ignore[assignment]
+
 # Options of kernels that neither make nor return arrays: references are not counted. Numba counts those of every array in a tuple, each
 # time that a kernel takes the tuple apart, which takes longer than many a step of a small lattice.
-# Kernels that they call take over that option; those that make arrays must not.
+# Kernels that they call take over that option; those that make arrays must not (`naibu._numba.references` checks it).
 UNCOUNTED: dict[str, Any] = {"_nrt": False} if tested() else {}
 COUNTED: dict[str, Any] = {"_nrt": True} if tested() else {}
 
@@ -55,7 +60,7 @@ def njit(function: Callable[..., Any] | None = None, *, cache: bool = False, **o
         compiled = numba.njit(**options)(named_apart(function, "__parallel") if options.get("parallel") else function)
         compiler = getattr(compiled, "_compiler", None)  # None where NUMBA_DISABLE_JIT is set, or on an untested Numba
         if compiler is not None and hasattr(compiled, "get_call_template"):
-            compiled.get_call_template = _Calls(compiled.get_call_template)
+            compiled.get_call_template = _Calls(compiled, compiled.get_call_template)
         if cache and compiler is not None and hasattr(compiler, "compile"):
             compiler.compile = CachedCompiler(compiled, compiler.compile)
             if called_apart():
@@ -73,10 +78,17 @@ class _Calls:
     types by a constant needs it, and gets it.
     """
 
-    def __init__(self, template: Callable[[Any, Any], Any]) -> None:
-        self._template = template
+    def __init__(self, kernel: Any, template: Callable[[Any, Any], Any]) -> None:
+        self._kernel, self._template = kernel, template
 
     def __call__(self, args: Any, named: Any) -> Any:
+        found = self._found(args, named)
+        result = self._kernel.overloads.get(tuple(found[2]))
+        if result is not None and references is not None:
+            references.require_counting_caller(_label(self._kernel), self._kernel.targetoptions, result.signature.return_type)
+        return found
+
+    def _found(self, args: Any, named: Any) -> Any:
         plain = tuple(map(numba.types.unliteral, args)), {name: numba.types.unliteral(value) for name, value in named.items()}
         try:
             return self._template(*plain)
@@ -101,11 +113,17 @@ class CachedCompiler:
 
     def __init__(self, kernel: Any, compile: Callable[[Any, Any], Any]) -> None:
         self._kernel, self._compile = kernel, compile
-        self._label = f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
+        self._label = _label(kernel)
         self._digest: str | None = None
 
     def __call__(self, args: Any, return_type: Any) -> Any:
         """Return the compile result, from its file where there is one."""
+        result = self._result(args, return_type)
+        if references is not None:
+            references.require_no_arrays(self._label, self._kernel.targetoptions, result.signature.return_type)
+        return result
+
+    def _result(self, args: Any, return_type: Any) -> Any:
         called = called_apart() and called_kernels.being_called() and not self._kernel.targetoptions.get("parallel")
         file = self._file(args, return_type, called)
         if file is None:
@@ -145,6 +163,10 @@ class CachedCompiler:
             return self._compile(args, return_type)
         finally:
             report(self._label, True)
+
+
+def _label(kernel: Any) -> str:
+    return f"{kernel.py_func.__module__}.{kernel.py_func.__qualname__}"
 
 
 def called_apart() -> bool:
