@@ -63,6 +63,7 @@ from naibu.identification.from_fields.regions.border_refinement import (
     RefinedRegions,
     on_finer_cells,
     refined_regions,
+    without_errors_of_cells,
 )
 from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
 from naibu.identification.from_fields.size_correction import SizeCorrection, without_size_of_elements
@@ -321,6 +322,10 @@ class _Recipe:
             return self._sharp(regions.zones, regions.point, None)
         self.record(f"borders of {refined.zones.count} regions within cells: misfit {refined.point.misfit:.4g}")
         corrected = self._corrected(refined)
+        fewer = None if corrected is None else without_errors_of_cells(self.model, regions, graph, corrected, self.bounds)
+        if fewer is not None:
+            self.record(f"of the regions on cells of half the size {fewer.zones.count} are left: others stood for errors of cells")
+            return self._with_borders(fewer, graph)
         refined = refined if corrected is None else corrected.refined
         model = self.model.with_zones(refined.zones)
         start = model.evaluate(refined.theta, refined.point.states)
