@@ -73,7 +73,7 @@ from naibu.identification.from_fields.surface.noise import SurfaceNoise
 from naibu.identification.from_fields.surface.skewness import distances_of_bounds
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
 from naibu.identification.from_fields.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
-from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
+from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, told_alike, with_limits
 from naibu.identification.load_case import require_load_cases
 
 FEW = 12  # zones up to which no penalty is needed by default
@@ -301,6 +301,10 @@ class _Recipe:
             words = (NO_REGIONS, *field.identifiability)
             return replace(field, segmentation=regions, steps=tuple(self.steps), identifiability=words)
         sharp = self._with_borders(regions, graph)
+        assert sharp.uncertainty is not None and sharp.verdict is not None  # of regions that were fitted without a penalty
+        told = told_alike(sharp.zones.names, sharp.theta, sharp.uncertainty, 0)
+        judged = replace(sharp.verdict, limits="; ".join(filter(None, (told, sharp.verdict.limits))))
+        sharp = replace(sharp, verdict=judged, identifiability=(judged.sentence, *sharp.identifiability[1:]))
         return replace(
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
             identifiability=(*sharp.identifiability, *field.identifiability),
