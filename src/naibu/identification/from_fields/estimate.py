@@ -81,6 +81,7 @@ START_POISSON_RATIO = 0.4
 NO_REGIONS = "No few regions of one material each explain the measurement: the result is a map under a penalty, without intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
+FAR = 0.5  # of a logarithm: whole cells may make an empty region of a soft one, about which derivatives say nothing of the one with borders
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
 
 
@@ -334,6 +335,8 @@ class _Recipe:
         model = self.model.with_zones(refined.zones)
         start = model.evaluate(refined.theta, refined.point.states)
         fitted = search(model, start, Objective(bounds=self.bounds), progress=self.progress).point
+        if np.abs(fitted.theta - refined.theta).max() > FAR:
+            fitted = model.evaluate(refined.theta, start.states)
         if corrected is not None:
             return self._estimate(model, model.evaluate(fitted.theta, fitted.states), Status.CONVERGED, refined, corrected)
         return self._sharp(refined.zones, fitted, refined)
