@@ -17,7 +17,13 @@ from naibu.identification.from_fields.forward.sensitivities import FieldModel, P
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, first_point, search
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph
 from naibu.identification.from_fields.regions import segmentation
-from naibu.identification.from_fields.regions.border_refinement import RefinedRegions, on_finer_cells, refined_borders, refined_regions
+from naibu.identification.from_fields.regions.border_refinement import (
+    RefinedRegions,
+    on_finer_cells,
+    refined_borders,
+    refined_regions,
+    without_errors_of_cells,
+)
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
 from naibu.identification.from_fields.regions.merging import merged
 from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined, segment, weight_of_borders
@@ -242,6 +248,13 @@ def test_corrections_for_the_size_of_cells_find_what_smaller_cells_made() -> Non
     assert (sd[0][2:] > 0.85 * whole).all()  # a ratio of bulk to shear modulus of a liver was off by .17, where .08 was stated
     off, left = (abs(np.log(young_and_poisson(t)[0][1] / truth[1])) for t in (found.theta, corrected.refined.theta))
     assert left < 0.5 * off
+    of_zone = np.zeros(fields.zones.count, dtype=np.int64)
+    of_zone[fields.zones.of_cell[zones.of_cell == 1]] = 1
+    graph, regions = ZoneGraph.of(fields.mesh, fields.zones), Segmentation(of_zone, zones, found.point, 8, 0)
+    assert without_errors_of_cells(again, regions, graph, corrected, Bounds()) is None
+    alike = replace(corrected, refined=replace(corrected.refined, theta=np.repeat(theta.reshape(2, -1)[:, 0], 2)))  # on the small cells
+    fewer = without_errors_of_cells(again, regions, graph, alike, Bounds())
+    assert fewer is not None and fewer.zones.count == 1 and not fewer.of_zone.any()
 
 
 def refined_borders_at(fields: FieldModel, borders: Borders) -> RefinedRegions:

@@ -9,7 +9,7 @@ import pytest
 
 from naibu.identification.from_fields.forward.sensitivities import logarithms
 from naibu.identification.from_fields.uncertainty import Uncertainty
-from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells, with_limits
+from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells, told_alike, with_limits
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
@@ -107,6 +107,16 @@ def test_what_the_measurement_leaves_open_is_in_the_first_sentence() -> None:
     )
     refused = replace(EXPLAINED, explanation=Explanation.NOT_EXPLAINED)
     assert with_limits(refused, NAMES, None, bounds) is refused
+
+
+def test_a_region_that_may_be_of_the_material_around_it_is_told() -> None:
+    """Young's moduli of 10 and 11 kPa with standard errors of a tenth are alike; those of 10 and 20 kPa are not, nor with common errors."""
+    theta = logarithms(*np.array([lame_parameters(e, 0.45) for e in (10.0, 11.0, 20.0)]).T)
+    names = ("body", "edge", "lump")
+    apart = Uncertainty(np.eye(6), np.diag([0.1**2] * 3 + [1e-6] * 3))
+    assert told_alike(names, theta, apart, 0) == "Young's modulus of edge may be that of body"
+    common = Uncertainty(np.eye(6), np.diag([1e-6] * 6) + 0.1**2 * np.outer([1, 1, 1, 0, 0, 0], [1, 1, 1, 0, 0, 0]))
+    assert told_alike(names, theta, common, 0) == ""
 
 
 def test_moduli_that_elements_determine_leave_the_verdict_as_it_is() -> None:

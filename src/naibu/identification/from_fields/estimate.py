@@ -64,6 +64,7 @@ from naibu.identification.from_fields.regions.border_refinement import (
     RefinedRegions,
     on_finer_cells,
     refined_regions,
+    without_errors_of_cells,
 )
 from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
 from naibu.identification.from_fields.size_correction import SizeCorrection, without_size_of_elements
@@ -73,7 +74,7 @@ from naibu.identification.from_fields.surface.noise import SurfaceNoise
 from naibu.identification.from_fields.surface.skewness import distances_of_bounds
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
 from naibu.identification.from_fields.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
-from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
+from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, told_alike, with_limits
 from naibu.identification.load_case import require_load_cases
 
 FEW = 12  # zones up to which no penalty is needed by default
@@ -81,6 +82,7 @@ START_POISSON_RATIO = 0.4
 NO_REGIONS = "No few regions of one material each explain the measurement: the result is a map under a penalty, without intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
+FAR = 0.5  # of a logarithm: whole cells may make an empty region of a soft one, about which derivatives say nothing of the one with borders
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
 
 
@@ -305,6 +307,10 @@ class _Recipe:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
             return replace(self._as_map(field, NO_REGIONS), segmentation=regions)
         sharp = self._with_borders(regions, graph)
+        assert sharp.uncertainty is not None and sharp.verdict is not None  # of regions that were fitted without a penalty
+        told = told_alike(sharp.zones.names, sharp.theta, sharp.uncertainty, 0)
+        judged = replace(sharp.verdict, limits="; ".join(filter(None, (told, sharp.verdict.limits))))
+        sharp = replace(sharp, verdict=judged, identifiability=(judged.sentence, *sharp.identifiability[1:]))
         return replace(
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
             identifiability=(*sharp.identifiability, *field.identifiability),
@@ -326,10 +332,16 @@ class _Recipe:
             return self._sharp(regions.zones, regions.point, None)
         self.record(f"borders of {refined.zones.count} regions within cells: misfit {refined.point.misfit:.4g}")
         corrected = self._corrected(refined)
+        fewer = None if corrected is None else without_errors_of_cells(self.model, regions, graph, corrected, self.bounds)
+        if fewer is not None:
+            self.record(f"of the regions on cells of half the size {fewer.zones.count} are left: others stood for errors of cells")
+            return self._with_borders(fewer, graph)
         refined = refined if corrected is None else corrected.refined
         model = self.model.with_zones(refined.zones)
         start = model.evaluate(refined.theta, refined.point.states)
         fitted = search(model, start, Objective(bounds=self.bounds), progress=self.progress).point
+        if np.abs(fitted.theta - refined.theta).max() > FAR:
+            fitted = model.evaluate(refined.theta, start.states)
         if corrected is not None:
             return self._estimate(model, model.evaluate(fitted.theta, fitted.states), Status.CONVERGED, refined, corrected)
         return self._sharp(refined.zones, fitted, refined)

@@ -15,7 +15,7 @@ import numpy as np
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.mesh_error import relative_change
-from naibu.identification.from_fields.uncertainty import Uncertainty
+from naibu.identification.from_fields.uncertainty import Uncertainty, young_and_poisson_slopes
 from naibu.identification.from_fields.verdict import SHARED
 from naibu.identification.verdict import UNDETERMINED, Explanation, Verdict
 
@@ -160,6 +160,32 @@ def with_limits(
         each = [f"that of {names[i]} within a factor of {factors[i]:.2g}" for i in np.flatnonzero(rough).tolist()]
         limits += [f"{who} Young's modulus only roughly, {' and '.join(each)}"] * bool(each)
     return replace(judged, limits="; ".join(limits)) if limits else judged
+
+
+def told_alike(names: Sequence[str], theta: FloatArray, found: Uncertainty, largest: int) -> str:
+    """Say of which regions of a map Young's modulus may, at 95 %, be that of the region number `largest`; empty where of none.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Regions.
+    theta : ndarray, shape (2 count,)
+        ln mu, then ln(kappa / mu).
+    found : Uncertainty
+        Of theta.
+    largest : int
+        Number of a region.
+    """
+    k, slopes = len(names), young_and_poisson_slopes(theta)[0]
+    logarithm, alike = np.log(young_and_poisson(theta)[0]), []
+    for i in (i for i in range(k) if i != largest):
+        way = np.zeros((2, k))
+        way[:, i], way[:, largest] = slopes[:, i], -slopes[:, largest]
+        both = np.ix_(used := np.array([i, largest, k + i, k + largest]), used)
+        sd = float(np.sqrt(max(way.ravel()[used] @ found.covariance[both] @ way.ravel()[used], 0.0)))
+        if abs(logarithm[i] - logarithm[largest]) < 1.96 * sd < np.log(UNDETERMINED):  # what is less determined is told as such
+            alike.append(names[i])
+    return f"Young's modulus of {' and '.join(alike)} may be that of {names[largest]}" if alike else ""
 
 
 def _between(low: float, high: float, unit: str) -> str:

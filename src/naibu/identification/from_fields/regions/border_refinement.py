@@ -25,11 +25,11 @@ from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
-from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, search
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph, cell_volumes
 from naibu.identification.from_fields.mesh_error import DOUBT, DOUBT_OF_RATIO, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
-from naibu.identification.from_fields.regions.contrast_prior import moderated
+from naibu.identification.from_fields.regions.contrast_prior import BorderPrior, moderated
 from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined
 
 MOST_REGIONS, CANDIDATES = 6, 3  # whose borders are refined; pairs that are tried as one
@@ -289,6 +289,7 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     """
     mixing, n, edge = found.mixing, len(found.theta), found.mixing.borders.edge_mm
     here, now, objective = _Trial(found.theta, found.borders.moves.ravel(), found.point, found.objective), found, Objective(bounds=bounds)
+    prior = _prior(mixing)
     residuals, converged, before, least, of_law = tuple[FloatArray, ...](), False, here, np.inf, True
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
@@ -303,9 +304,8 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
         before, least = here, left
         slopes = mixing.moduli(here.theta, here.moves)[1]
         quadratic = at.concentrated(slopes, ROUGH_TOLERANCE)
-        hessian = quadratic.hessian.copy()
-        hessian[n:, n:] += np.eye(len(here.moves)) / edge**2
-        pull = np.concatenate([np.zeros(n), (here.moves - mixing.borders.moves.ravel()) / edge**2])
+        hessian = quadratic.hessian + prior.hessian(here.theta)
+        pull = prior.gradient(here.theta, here.moves)
         fit = refitted(at, replace(quadratic, hessian=hessian), changes, slopes, pull)
         scale = min(RELAXED, LONGEST / max(np.abs(fit.theta[:n]).max(), np.abs(fit.theta[n:]).max() / edge, 1e-300))
         theta, moves = objective.clipped(here.theta + scale * fit.theta[:n]), here.moves + scale * fit.theta[n:]
@@ -317,6 +317,37 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
         if converged:
             break
     return CorrectedRegions(_with_covariance(model, mixing, here), residuals, here.theta - found.theta, converged, of_law)
+
+
+def without_errors_of_cells(
+    model: FieldModel, regions: Segmentation, graph: ZoneGraph, corrected: CorrectedRegions, bounds: Bounds
+) -> Segmentation | None:
+    """Return regions, with a piece each, without those for which cells of half the size leave no reason; None where all have one.
+
+    Cells of a map err most where displacements change fastest, as at the edges of plates, and a region of other moduli may stand for that.
+    On cells of half the size its moduli are those of the largest region, but for what it costs to be one.
+    """
+    found, k = corrected.refined, corrected.refined.zones.count
+    charge, kept = float(np.log(model.n_free) + np.log(graph.count)), np.ones(k, dtype=bool)
+    for region in range(1, k):
+        jump = np.kron(np.eye(2), np.eye(k)[region] - np.eye(k)[0])
+        away = jump @ found.theta
+        kept[region] = 0.5 * away @ np.linalg.solve(jump @ found.at_these_borders @ jump.T, away) > charge
+    if kept.all():
+        return None
+    unknown, piece = model.zones.of_cell != KNOWN, found.borders.piece_of_cell
+    of_zone = np.empty(graph.count, dtype=np.int64)
+    of_zone[model.zones.of_cell[unknown]] = np.where(kept[found.borders.region_of_piece[piece]], piece, 0)[unknown]
+    of_zone = np.unique(of_zone, return_inverse=True)[1].ravel().astype(np.int64)
+    zones, volume = joined(model.zones, of_zone), np.bincount(of_zone, graph.volume)
+    theta = np.concatenate([np.bincount(of_zone, graph.volume * t) / volume for t in found.point.theta.reshape(2, -1)])
+    fewer = model.with_zones(zones)
+    return replace(
+        regions,
+        of_zone=of_zone,
+        zones=zones,
+        point=search(fewer, fewer.evaluate(theta, found.point.states), Objective(bounds=bounds)).point,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -331,19 +362,20 @@ class _Trial:
     @classmethod
     def at(cls, model: FieldModel, mixing: Mixing, theta: FloatArray, moves: FloatArray, states: Sequence[FloatArray]) -> _Trial:
         point = model.evaluate(mixing.moduli(theta, moves)[0], list(states))
-        away = (moves - mixing.borders.moves.ravel()) / mixing.borders.edge_mm
-        return cls(theta, moves, point, 0.5 * (point.misfit + point.prior + float(away @ away)))
+        return cls(theta, moves, point, 0.5 * (point.misfit + point.prior) + _prior(mixing).value(theta, moves))
+
+
+def _prior(mixing: Mixing) -> BorderPrior:
+    return BorderPrior(mixing.borders.moves.ravel(), mixing.borders.edge_mm)
 
 
 def _stepped(model: FieldModel, mixing: Mixing, here: _Trial, bounds: Bounds) -> _Trial | None:
     """Return where a Gauss-Newton step leads, halved until the objective falls; None where it never does."""
-    n, edge, objective = len(here.theta), mixing.borders.edge_mm, Objective(bounds=bounds)
+    n, edge, objective, prior = len(here.theta), mixing.borders.edge_mm, Objective(bounds=bounds), _prior(mixing)
     slopes = mixing.moduli(here.theta, here.moves)[1]
     at = model.linearised(model.evaluate(here.point.theta, here.point.states))
     quadratic = at.concentrated(slopes, ROUGH_TOLERANCE)
-    hessian, gradient = quadratic.hessian.copy(), quadratic.gradient.copy()
-    hessian[n:, n:] += np.eye(len(here.moves)) / edge**2
-    gradient[n:] += (here.moves - mixing.borders.moves.ravel()) / edge**2
+    hessian, gradient = quadratic.hessian + prior.hessian(here.theta), quadratic.gradient + prior.gradient(here.theta, here.moves)
     step = -np.asarray(np.linalg.solve(hessian, gradient), dtype=float)
     step *= min(1.0, LONGEST / max(np.abs(step[:n]).max(), np.abs(step[n:]).max() / edge, 1e-300))
     moved = at.forward((slopes @ step)[:, None], [b[:, None] for b in quadratic.loaded(step)])
@@ -361,10 +393,9 @@ def _stepped(model: FieldModel, mixing: Mixing, here: _Trial, bounds: Bounds) ->
 
 def _with_covariance(model: FieldModel, mixing: Mixing, found: _Trial) -> RefinedRegions:
     """Return what was found as regions, with the covariance of the moduli."""
-    theta, moves, n, edge = found.theta, found.moves, len(found.theta), mixing.borders.edge_mm
+    theta, moves, n = found.theta, found.moves, len(found.theta)
     point = model.evaluate(found.point.theta, found.point.states)
-    hessian = model.linearised(point).concentrated(mixing.moduli(theta, moves)[1], ROUGH_TOLERANCE).hessian.copy()
-    hessian[n:, n:] += np.eye(len(moves)) / edge**2
+    hessian = model.linearised(point).concentrated(mixing.moduli(theta, moves)[1], ROUGH_TOLERANCE).hessian + _prior(mixing).hessian(theta)
     try:
         whole, part = (np.asarray(np.linalg.inv(h)[:n, :n], dtype=float) for h in (hessian, hessian[:n, :n]))
     except np.linalg.LinAlgError as error:

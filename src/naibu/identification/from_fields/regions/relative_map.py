@@ -36,7 +36,7 @@ from naibu.identification.from_fields.mesh_error import TOO_COARSE
 from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, intervals, young_and_poisson_slopes
 from naibu.identification.from_fields.verdict import FEW_POINTS, told_points
-from naibu.identification.from_fields.verdict_within_cells import with_limits
+from naibu.identification.from_fields.verdict_within_cells import told_alike, with_limits
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 ONE_MATERIAL = (
@@ -152,7 +152,9 @@ def _relative(found: FieldEstimate, few: str = "") -> FieldEstimate:
     regularized = found.regularized and (found.regularized[0] / np.exp(unit), found.regularized[1])
     assert found.verdict is not None  # of regions that were fitted without a penalty
     of_law = hangs_on_law(found.verdict, found.free_law, uncertainty, theta)
-    judged = with_limits(replace(found.verdict, limits=few), found.zones.names, None, intervals(theta, uncertainty)[0], "", of_law=of_law)
+    limits = "; ".join(filter(None, (few, told_alike(found.zones.names, theta, uncertainty, zone))))
+    bounds = intervals(theta, uncertainty)[0]
+    judged = with_limits(replace(found.verdict, limits=limits), found.zones.names, None, bounds, "", of_law=of_law)
     found = replace(found, verdict=judged)
     return replace(
         found, theta=theta, uncertainty=uncertainty, assumptions=others, regularized=regularized, budget=None,
