@@ -3,11 +3,11 @@ from .equilibrium_gap.incremental import IncrementalEstimate, incremental_equili
 from .equilibrium_gap.weighted import weighted_equilibrium_gap
 from .from_fields.assumptions.other_assumptions import Assumption, MovedBorder
 from .from_fields.estimate import identify_field
-from .from_fields.experiment_design import Accuracy, expected_accuracy
 from .from_fields.field_estimate import FieldEstimate
 from .from_fields.forward.load_cases import FieldLoadCase, KnownRegion, Zones
 from .from_fields.identified.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
 from .from_fields.identified.identified_body import IdentifiedBody
+from .from_fields.planning.experiment_design import Accuracy, expected_accuracy
 from .from_fields.regions.relative_map import identify_relative_map
 from .from_fields.uncertainty import ErrorBudget, cramer_rao_bound
 from .from_markers.calibration import Calibration, calibrate

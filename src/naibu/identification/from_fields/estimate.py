@@ -22,21 +22,18 @@ from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumed_law
-from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
+from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import (
-    Concentrated,
     FieldModel,
-    Linearised,
     Point,
     logarithms,
     young_and_poisson,
 )
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.inversion.gauss_newton import (
-    AT_BOUND,
     Bounds,
     Found,
     Objective,
@@ -49,15 +46,7 @@ from naibu.identification.from_fields.inversion.gauss_newton import (
 from naibu.identification.from_fields.inversion.regularization import Regularization, RegularizationName, ZoneGraph, regularization
 from naibu.identification.from_fields.inversion.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
 from naibu.identification.from_fields.inversion.truncated_newton import truncated_step
-from naibu.identification.from_fields.mesh_error import (
-    COARSE,
-    at_least_to,
-    doubt_in_all,
-    one_cell_thick,
-    relative_change,
-    stretch_of,
-    told_of_elements,
-)
+from naibu.identification.from_fields.region_estimate import EstimateSettings, RegionFit, region_estimate
 from naibu.identification.from_fields.regions.border_refinement import (
     MOST_REGIONS,
     CorrectedRegions,
@@ -67,14 +56,8 @@ from naibu.identification.from_fields.regions.border_refinement import (
     without_errors_of_cells,
 )
 from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
-from naibu.identification.from_fields.size_correction import SizeCorrection, without_size_of_elements
-from naibu.identification.from_fields.statement import statement
-from naibu.identification.from_fields.surface.bias import LEFT, without_bias
-from naibu.identification.from_fields.surface.noise import SurfaceNoise
-from naibu.identification.from_fields.surface.skewness import distances_of_bounds
-from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals, resolution, resolution_report
-from naibu.identification.from_fields.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
-from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, told_alike, with_limits
+from naibu.identification.from_fields.uncertainty import resolution, resolution_report
+from naibu.identification.from_fields.verdict_within_cells import told_alike
 from naibu.identification.load_case import require_load_cases
 
 FEW = 12  # zones up to which no penalty is needed by default
@@ -381,76 +364,9 @@ class _Recipe:
         refined: RefinedRegions | None = None,
         corrected: CorrectedRegions | None = None,
     ) -> FieldEstimate:
-        """Return moduli that were fitted without a penalty, with the errors of measurement, discretisation and knowledge."""
-        freedom = model.n_free - 2.0 * model.zones.count
-        variance = point.misfit / freedom if freedom > 0.0 else 1.0
-        best, score = point.theta, without_bias(model, point, Objective(bounds=self.bounds), variance)
-        at, quadratic, point = score.at, score.quadratic, score.at.point
-        noise = SurfaceNoise.of(at, quadratic, variance)
-        size = self._size(at, quadratic, noise, point.theta - best, refined, corrected)
-        theta, residuals, shift, alike = size.theta, size.residuals, size.shift, size.alike
-        stretch = stretch_of(np.zeros_like(theta) if shift is None or corrected is not None else shift)
-        misfit = sum(float(r @ r) for r in residuals)
-        factor = 1.0 if freedom <= 0.0 else max(1.0, float(np.sqrt(misfit / freedom)))
-        of_noise = Uncertainty.of(noise.information.matrix, factor)
-        shared = inflation(model.observed, residuals, at.jacobians(quadratic), of_noise.covariance, freedom)
-        of_noise = Uncertainty(of_noise.information / shared, of_noise.covariance * shared)
-        of_noise = of_noise.with_sides(distances_of_bounds(score, of_noise, variance, factor * float(np.sqrt(shared))))
-        at, of_noise = model.linearised(model.evaluate(point.theta, point.states)), of_noise.with_added(size.of_noise)
-        if refined is not None:
-            of_noise = of_noise.with_added(factor**2 * shared * (refined.covariance - refined.at_these_borders)).with_added(refined.apart)
-        on_mesh, of_noise = of_noise, of_noise.stretched(stretch)
-        of_known = covariance_of(others := assumptions(at, quadratic, self.law, stretch, self.borders), len(theta))
-        free, law = assumed_law.with_law_free(at, None if shift is None else residuals, freedom, stretch)
-        judged, names = with_enough_points(verdict(model.observed, residuals, freedom), model), model.zones.names
-        thin = () if self.region_at is None or corrected is not None else one_cell_thick(model.mesh)
-        if self.region_at is not None and shift is not None:
-            half = HalfSize(point.theta, theta, on_mesh, beyond_noise=(point.misfit - freedom, misfit - freedom))
-            judged = judged_within_cells(judged, names, half, np.isin(names, thin))
-        of_mesh, total, coarse = np.full(len(theta), np.nan), of_noise.with_added(of_known).with_law(law), False
-        if shift is not None:
-            sure = on_mesh.standard_deviations() < DETERMINED
-            if corrected is None:
-                layers, apart = np.isin(names, thin) if thin else None, np.isin(names, judged.mesh_dependent)
-                change, mixed = relative_change(shift), self.region_at is not None or not alike or model.surface_sought
-                covariance = doubt_in_all(change, sure, quadratic.hessian, apart, mixed=mixed, thin=layers)
-                coarse = bool(sure.any()) and (bool(thin) or float(np.abs(change[sure]).max(initial=0.0)) > COARSE)
-            else:
-                covariance, coarse = corrected.doubt, not corrected.converged
-            covariance = at_least_to(self.other_mesh, theta, covariance * np.outer(stretch, stretch))
-            of_mesh, total = np.sqrt(np.diag(covariance)), total.with_added(covariance)
-        taken = best - point.theta + (bias := score.left(noise.information))
-        unsaid = np.repeat([0.0, 0.0 if tells_poisson(model) else AT_BOUND], len(theta) // 2)
-        total = total.with_added(np.outer(LEFT * taken, LEFT * taken)).with_added(np.diag(self.bounds.doubt_at(theta) ** 2 + unsaid**2))
-        theta = np.where(self.bounds.doubt_at(theta) > 0.0, theta, Objective(bounds=self.bounds).clipped(theta - bias))
-        by_elements = None if shift is None else replace(of_noise, covariance=covariance).of_young_and_poisson(theta)[0]
-        judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total)
-        judged = with_limits(judged, names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
-        budget = ErrorBudget(of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), shared)
-        limits = (*told_of_elements(coarse, thin), *(FEW_POINTS,) * (not tells_poisson(model)))
-        words = statement(judged, model.zones, theta, total, others, limits=limits, budget=budget)
-        return FieldEstimate(
-            model.mesh, model.zones, theta, tuple(u[: model.mesh.n_points] for u in point.states), misfit, freedom, total, None, None, None,
-            None, status, tuple(self.steps), words, judged, budget, shift, others,
-            None if refined is None else refined.borders, None if refined is None else refined.parts, taken, free,
-        )  # fmt: skip
-
-    def _size(
-        self,
-        at: Linearised,
-        quadratic: Concentrated,
-        noise: SurfaceNoise,
-        from_best: FloatArray,
-        refined: RefinedRegions | None,
-        corrected: CorrectedRegions | None,
-    ) -> SizeCorrection:
-        """Return moduli at vanishing element size, which regions whose borders run through cells may have already, `from_best` fit on."""
-        if corrected is not None:
-            none, theta = np.zeros_like(quadratic.hessian), Objective(bounds=self.bounds).clipped(corrected.refined.theta + from_best)
-            return SizeCorrection(theta, corrected.residuals, corrected.shift, True, none, ())
-        found = without_size_of_elements(at, quadratic, noise, self.law, self.elements, self.bounds, self.region_at)
-        for told in found.told:
+        """Return moduli that were fitted without a penalty, with their errors."""
+        settings = EstimateSettings(self.law, self.elements, self.bounds, self.region_at, self.borders, self.other_mesh)
+        found = region_estimate(RegionFit(model, point, status, refined, corrected), settings)
+        for told in found.steps:
             self.record(told)
-        if refined is None:
-            return found
-        return replace(found, theta=Objective(bounds=self.bounds).clipped(found.theta + refined.theta - at.point.theta + from_best))
+        return replace(found, steps=tuple(self.steps))

@@ -9,10 +9,10 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.experiment_design import Accuracy, expected_accuracy
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, logarithms, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Objective, first_point, search
+from naibu.identification.from_fields.planning.experiment_design import Accuracy, expected_accuracy
 from naibu.meshing.point_location import interpolation_operator
 from naibu.reproduction.chapter3.bodies import PushedBody, cube
 from naibu.viewer.chapters.chapter import Figure, Section

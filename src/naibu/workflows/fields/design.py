@@ -24,7 +24,7 @@ from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.identified.sides import SIDES
-from naibu.identification.from_fields.planned_identification import planned_identification
+from naibu.identification.from_fields.planning.planned_identification import planned_identification
 from naibu.identification.verdict import UNDETERMINED
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record

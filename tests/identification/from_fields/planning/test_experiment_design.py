@@ -9,10 +9,10 @@ import pytest
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
-from naibu.identification.from_fields.experiment_design import expected_accuracy
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, logarithms, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Objective, first_point, search
+from naibu.identification.from_fields.planning.experiment_design import expected_accuracy
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.reproduction.chapter3.bodies import cube
 

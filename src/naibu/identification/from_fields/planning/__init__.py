@@ -1,0 +1,1 @@
+"""What an experiment that is planned will tell of moduli."""
