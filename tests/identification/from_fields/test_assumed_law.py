@@ -22,6 +22,7 @@ from naibu.identification.from_fields.assumptions.free_law import FreeLaw
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.regions.relative_map import relative_to
 from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law, intervals
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.primitives import box
@@ -119,3 +120,16 @@ def test_a_map_says_first_that_it_takes_the_law_for_right() -> None:
     assert warned(0.01, ("Resolved.", "More.")) == ("Resolved.", "More.")
     first, second = warned(0.2, ("Resolved.", "More."))
     assert first.startswith("Resolved. The map takes the law for right at strains of 20 per cent") and second == "More."
+
+
+def test_multiples_of_a_modulus_hold_the_form_of_the_law_of_both() -> None:
+    theta, rng = np.log([100.0, 200.0, 8.0, 9.0]), np.random.default_rng(0)
+    root = rng.standard_normal((4, 4))
+    plain = Uncertainty(root @ root.T, np.linalg.inv(root @ root.T))
+    law = LawPart(np.array([0.2, 0.2, 0.0, 0.0]), np.diag([0.04, 0.0, 0.0, 0.0]))
+    relative, exact = relative_to(plain.with_law(law), theta, 0), relative_to(plain, theta, 0)
+    np.testing.assert_allclose(relative.if_law_exact.covariance, exact.covariance, atol=1e-12)
+    assert relative.law is not None
+    assert relative.law.shift == pytest.approx(np.zeros(4))  # the same change of both moduli
+    assert relative.law.covariance[1, 1] == pytest.approx(0.04)
+    assert relative.of_young_and_poisson(theta)[0][0] == pytest.approx(0.0, abs=1e-6)

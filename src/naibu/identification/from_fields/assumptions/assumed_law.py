@@ -13,7 +13,7 @@ from naibu.identification.from_fields.assumptions.free_law import FreeLaw, free_
 from naibu.identification.from_fields.assumptions.other_assumptions import holds
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, young_and_poisson
-from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law, intervals
+from naibu.identification.from_fields.uncertainty import EXACT, LawPart, Uncertainty, by_law, intervals
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.elements import elements
 
@@ -106,7 +106,8 @@ def hangs_on_law(judged: Verdict, free: FreeLaw | None, total: Uncertainty, thet
     if free is None or any(reason.startswith(DOES_NOT_FIT) for reason in judged.reasons):
         return ""
     if not free.found:
-        return NOT_SOUGHT
+        sd = total.of_young_and_poisson(theta)[0]
+        return NOT_SOUGHT if (np.isfinite(sd) & (sd > EXACT)).any() else ""
     if total.law is None:
         bounds, other = intervals(theta, total)[0], young_and_poisson(theta + free.shift)[0]
         hangs = any(not holds(low, high, e) for e, (low, high) in zip(other, bounds, strict=True))
