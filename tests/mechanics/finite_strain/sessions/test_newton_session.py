@@ -1,4 +1,4 @@
-"""Steps that iterations with an earlier tangent do not solve: when Newton's method is asked, and what is done where it gives up."""
+"""Steps that iterations with an earlier tangent do not solve: when Newton's method is asked."""
 
 from __future__ import annotations
 
@@ -10,14 +10,11 @@ import pytest
 from touched_models import small_mesh
 
 from naibu.core.arrays import FloatArray
-from naibu.core.errors import ConvergenceError
 from naibu.mechanics.finite_strain.sessions import real_time_session
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeEngine, RealTimeSession
 from naibu.mechanics.finite_strain.sessions.tangent_session import TangentSession
 from naibu.simulation import FiniteElementBody
-
-NEWTON = "naibu.mechanics.finite_strain.sessions.newton_session.NEWTON_S"
 
 
 def pulled(background: bool) -> tuple[RealTimeSession, FloatArray]:
@@ -35,23 +32,6 @@ def pulled(background: bool) -> tuple[RealTimeSession, FloatArray]:
 def stepped(session: RealTimeSession, velocity: FloatArray) -> None:
     while session.step_within(1e-3, velocity) is None:
         pass
-
-
-def test_where_newtons_method_gives_up_the_best_of_the_iterations_is_taken_and_what_is_out_of_balance_is_told(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Iterations whose every balance is refused; one that is too far from a balance fails, as ever."""
-    monkeypatch.setattr(NEWTON, 0.0)
-    monkeypatch.setattr(real_time_session, "ACCEPTED", -1.0)
-    session, velocity = pulled(background=False)
-    with closing(session):
-        stepped(session, velocity)
-        assert 0.0 < session.unbalanced < real_time_session.LAST_RESORT
-        moved = session.state()
-        monkeypatch.setattr(real_time_session, "LAST_RESORT", -1.0)
-        with pytest.raises(ConvergenceError, match="finds no balance"):
-            stepped(session, velocity)
-        np.testing.assert_array_equal(session.state().displacement, moved.displacement)
 
 
 def test_a_step_behind_one_that_newtons_method_took_fast_does_not_wait_for_a_tangent(monkeypatch: pytest.MonkeyPatch) -> None:

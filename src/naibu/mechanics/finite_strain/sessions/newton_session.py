@@ -19,7 +19,7 @@ from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSessio
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.tangent_session import TangentSession
 
-NEWTON_S = 4.0  # of a processor for Newton's method in a step for which a loop waits
+NEWTON_S = 10.0  # of a processor for Newton's method in a step for which a loop waits
 
 
 @dataclass(slots=True, eq=False)
