@@ -19,7 +19,7 @@ from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSessio
 from naibu.mechanics.finite_strain.sessions.implicit_step import ImplicitStep
 from naibu.mechanics.finite_strain.sessions.tangent_session import TangentSession
 
-NEWTON_S = 4.0  # of a processor for Newton's method in a step for which a loop waits
+NEWTON_S = 10.0  # of a processor for Newton's method in a step for which a loop waits
 
 
 @dataclass(slots=True, eq=False)
@@ -34,7 +34,6 @@ class NewtonSession(TangentSession):
 
     newton_steps: int = field(init=False, default=0)
     _newton_until: float = field(init=False, default=np.inf)  # processor time at which Newton's method gives a step up
-    _newton_s: float = field(init=False, default=np.inf)  # of a processor for the last step, where Newton's method took it in a thread
 
     def _newtons_beside(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, FloatArray | None]:
         """Return what Newton's method finds for a step, as `DynamicSession._balanced`; a thread looks for it, with a copy of the session.
@@ -50,17 +49,13 @@ class NewtonSession(TangentSession):
                 yield from self._pause()
         finally:
             apart._newton_until = -np.inf
-        self._newton_s = apart._newton_s if self._engine.background and found.result() is not None else np.inf
         return found.result()
 
     def _hand_over(self, moving: FloatArray, contacts: tuple[Contact, ...], found: Future[FloatArray | None]) -> None:
         """Hand over what Newton's method finds for a step."""
         try:
-            began = time.thread_time()
-            self._newton_until = min(self._newton_until, began + NEWTON_S)
-            balanced = DynamicSession._balanced(self, self.engine.step, moving, contacts)
-            self._newton_s = time.thread_time() - began
-            found.set_result(balanced)
+            self._newton_until = min(self._newton_until, time.thread_time() + NEWTON_S)
+            found.set_result(DynamicSession._balanced(self, self.engine.step, moving, contacts))
         except BaseException as error:
             found.set_exception(error)
 

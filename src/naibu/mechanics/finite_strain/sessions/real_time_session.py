@@ -39,9 +39,6 @@ ITERATIONS = 5  # of a step at most
 USUAL = 3  # of a step whose balance is then passable
 DEPTH = 4  # earlier iterations that are mixed
 ACCEPTED = 0.06  # of a step that has used up its iterations; where it was 0.2, some later steps found no balance and took seconds
-LAST_RESORT = 0.2  # of a step for which a loop waits and Newton's method finds no balance: better than one that fails and is tried again
-NEWTON_PAYS = 2.0  # times that of a tangent: time of Newton's method from which on the next step waits for a tangent of its own first
-HASTY = 0.3  # of the time of a tangent: for iterations where Newton's method is likely to be needed
 BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is taken; one that is worse goes on, and real time is lost
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
 FURTHER, NEARER = 5, 0.7  # more of them, where the others reduced the error to so much of what it was before
@@ -106,7 +103,6 @@ class RealTimeSession(NewtonSession):
     _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
     _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
     _patience: float = field(init=False, default=np.inf)  # processor time at which a step gives an earlier tangent up
-    _nearest: Trial | None = field(init=False, default=None)  # of a step whose iterations found no balance
     _search: Generator[None, None, Trial | FloatArray | None] | None = field(init=False, default=None)  # of the step under way
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
@@ -169,7 +165,7 @@ class RealTimeSession(NewtonSession):
         whole = h == self.engine.step
         found = self._gone_on(self._search or self._sought(moving, contacts)) if whole else None
         if isinstance(found, Trial):
-            self._trial, self._newton_s = found, np.inf
+            self._trial = found
             return found.displacement
         self.newton_steps += whole
         self._pressure, self._trial, self._near, self._gaps = None, None, (), ()
@@ -180,17 +176,11 @@ class RealTimeSession(NewtonSession):
         return DynamicSession._balanced(self, h, moving, contacts)
 
     def _sought(self, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, Trial | FloatArray | None]:
-        """Return the balance of a step; what Newton's method finds where it is needed, if a loop waits: a thread then tries that.
-
-        Where it finds none either, the best of the iterations is returned if it is not far from a balance; `unbalanced` then tells it.
-        """
-        self._nearest = None
+        """Return the balance of a step; what Newton's method finds where it is needed, if a loop waits: a thread then tries that."""
         trial = yield from self._quasi_newton(moving, contacts)
         if trial is not None or self._until == np.inf:
             return trial
-        found = yield from self._newtons_beside(moving, contacts)
-        nearest = self._nearest
-        return self._looked_at(nearest) if found is None and nearest is not None and nearest.error <= LAST_RESORT else found
+        return (yield from self._newtons_beside(moving, contacts))
 
     def _gone_on(self, search: Generator[None, None, Trial | FloatArray | None]) -> Trial | FloatArray | None:
         """Return what a search finds; where it takes longer than it may, it is kept for the next call."""
@@ -232,27 +222,18 @@ class RealTimeSession(NewtonSession):
             pressure = self._engine._elements.bulk * self._engine._elements.dilatation(start.displacement)[0]
         before, now = self.iterations, time.thread_time()
         deadline = now + BUDGET_S if self._engine.background else np.inf
-        # where the last step needed Newton's method, this one does, too, unless that takes far longer than a tangent
-        likely = self._newton_s <= NEWTON_PAYS * tangent.seconds
         # iterations that have taken as long as a tangent of the step's own would, and found nothing, are given up for it
-        patience = max(BUDGET_S, (HASTY if likely else 1.0) * tangent.seconds)
-        self._patience = now + patience if self._engine.background else np.inf
+        self._patience = now + max(BUDGET_S, tangent.seconds) if self._engine.background else np.inf
         best = yield from self._from_guesses(tangent, moving, inertial, pressure, deadline)
-        if (best is None or best.error > ACCEPTED) and not likely:
-            self.waits, self._patience = self.waits + 1, np.inf
-            again = yield from self._from_guesses((yield from self._renewed()), moving, inertial, pressure, np.inf)
-            best = best if again is None else again.better(best)
         if best is None or best.error > ACCEPTED:
-            self._nearest = best
+            self.waits, self._patience = self.waits + 1, np.inf
+            best = yield from self._from_guesses((yield from self._renewed()), moving, inertial, pressure, np.inf)
+        if best is None or best.error > ACCEPTED:
             return None
+        for near in self._near:  # gaps and responses are those of the last trial
+            near.add_force(best.displacement, np.zeros_like(best.displacement))
         self._spare = self.iterations == before
-        return self._looked_at(best)
-
-    def _looked_at(self, trial: Trial) -> Trial:
-        """Return a trial, with gaps and responses of contacts as they are in it: they had been those of the last one."""
-        for near in self._near:
-            near.add_force(trial.displacement, np.zeros_like(trial.displacement))
-        return trial
+        return best
 
     def _from_guesses(
         self, tangent: EarlierTangent, moving: FloatArray, inertial: FloatArray, pressure: FloatArray, deadline: float
@@ -429,11 +410,7 @@ class RealTimeSession(NewtonSession):
         trial, self._slipped, self._begun = self._trial, self.reached.lips, self.reached.multipliers
         self.unbalanced = 0.0 if trial is None else trial.unbalanced
         if trial is None:
-            forces = DynamicSession._accepted(self, h, u, contacts, spin)
-            if self._engine.background and h == self.engine.step:  # a step that waited for no tangent has left those there are far behind
-                self._near = self._all_near(contacts, self.reached.displacement)
-                self._renew(self._soon_touched(contacts, [near.gap for near in self._near]))
-            return forces
+            return DynamicSession._accepted(self, h, u, contacts, spin)
         of_indenters, anchors, gaps = np.zeros((len(contacts), 3)), [], []
         for k, (contact, near) in enumerate(zip(contacts, self._near, strict=True)):
             of_indenters[k] = near.response.orientation @ near.response.force.sum(axis=0)

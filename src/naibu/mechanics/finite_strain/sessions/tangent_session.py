@@ -55,17 +55,12 @@ class TangentSession(DynamicSession):
         """
         u = self.reached.displacement
         contacts = self._still()
-        near = self._all_near(contacts, u)
+        near = [NearbyContact.of(c, a, np.zeros(len(c.nodes)), np.inf) for c, a in zip(contacts, self.reached.anchors, strict=True)]
+        for some in near:
+            some.add_force(u, np.zeros_like(u))
         touching = tuple(some.touching() for some in near)
         ahead = self._soon_touched(contacts, [some.gap for some in near])
         self._engine._rest[:] = [self._made(u, touching, self._places, self._held(), ahead, self._slipped, self._begun)]
-
-    def _all_near(self, contacts: Sequence[Contact], u: FloatArray) -> tuple[NearbyContact, ...]:
-        """Return all points of contacts, with gaps and responses at a displacement (n, 3), mm."""
-        near = tuple(NearbyContact.of(c, a, np.zeros(len(c.nodes)), np.inf) for c, a in zip(contacts, self.reached.anchors, strict=True))
-        for some in near:
-            some.add_force(u, np.zeros_like(u))
-        return near
 
     def close(self) -> None:
         """End the thread and release the factors."""
