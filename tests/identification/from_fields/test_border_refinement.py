@@ -97,6 +97,7 @@ def test_a_compact_region_starts_as_a_ball_and_a_slab_does_not() -> None:
     assert not Borders.of(fields.mesh, slab).rounded().round.any()
 
 
+@pytest.mark.slow
 def test_moduli_on_half_the_cells_are_on_average_those_of_the_cells() -> None:
     """A linear border cuts off of a cell what it cuts off of the eight cells in it."""
     fields, zones = model()
@@ -142,7 +143,7 @@ def test_derivatives_where_two_lumps_are_of_one_material() -> None:
     assert mixing.borders.region_at(at, np.zeros(3)).tolist() == [1, 1, 0]
 
 
-@pytest.mark.parametrize(("other", "regions"), [(12.0, 2), (40.0, 3)])
+@pytest.mark.parametrize(("other", "regions"), [pytest.param(12.0, 2, marks=pytest.mark.slow), (40.0, 3)])
 def test_lumps_are_of_one_material_where_the_data_do_not_tell_their_moduli_apart(other: float, regions: int) -> None:
     """Of lumps of one size, one has too many cells and one too few, so that their moduli differ until borders are free."""
     fields, pieces = _two_lumps()

@@ -41,6 +41,7 @@ def test_accurate_measurements_are_left_as_they_are() -> None:
     np.testing.assert_allclose(found.theta, TRUTH, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_moduli_do_not_follow_the_noise_that_the_surface_takes_up() -> None:
     """One point for every component that is sought, noise of 1.5 % of the push: what draws of it leave in the mean, and intervals hold."""
     mesh, zones, exact = gel_on_a_pad()

@@ -107,6 +107,7 @@ def test_a_given_mask_gives_what_it_gives_in_memory() -> None:
     assert 0.85 < np.median(sd[both] / stated) < 1.3
 
 
+@pytest.mark.slow
 def test_a_part_that_swells_is_found_as_in_memory() -> None:
     part = SwollenSphere((24.0, 29.5, 25.5), 12.0, 1.15)
     body = swollen_body([part], seed=1, noise=20.0)

@@ -120,6 +120,7 @@ def test_the_work_on_a_part_is_that_of_its_displacement() -> None:
         assert work[at] == pytest.approx(float((pull * _swelling(arm)).sum()) * _cell_mm(grid), rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 def test_where_volume_is_kept_all_cells_have_one_weight() -> None:
     """The body moves rigidly; random fields that were solved to a relative 0.06 held 27 % of it where there was much noise."""
     for noise in (5.0, MUCH_NOISE):
@@ -131,7 +132,7 @@ def test_where_volume_is_kept_all_cells_have_one_weight() -> None:
         assert held(body, found, body.mask) > 0.9
 
 
-@pytest.mark.parametrize("ratio", [1.2, 0.8])
+@pytest.mark.parametrize("ratio", [1.2, pytest.param(0.8, marks=pytest.mark.slow)])
 def test_a_body_that_swells_or_shrinks_as_a_whole_is_seen_to(ratio: float) -> None:
     """All cells held it back by .02 of the volume, and it was off by .09 mm, until the ratio of volumes was that of the body."""
     body, found = measured(SwollenSphere(tuple(MIDDLE_MM), 100.0, ratio), noise=MUCH_NOISE)

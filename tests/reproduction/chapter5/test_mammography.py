@@ -51,6 +51,7 @@ def test_cells_of_a_stretched_lattice_have_its_determinant() -> None:
     assert ratio == pytest.approx(np.linalg.det(gradient))
 
 
+@pytest.mark.slow
 def test_the_outlines_bring_points_of_a_scan_nearer_to_their_places() -> None:
     section = scans_section()
     tables = Tables((section,))

@@ -177,6 +177,7 @@ def test_cells_end_where_zones_meet_in_a_plane(folder: Path) -> None:
             assert (cells >= 0).sum() == inside.values.sum()
 
 
+@pytest.mark.slow
 def test_plane_borders_may_lie_anywhere_within_a_voxel(folder: Path) -> None:
     """What half a voxel is foretold to change is what labels with the border elsewhere give, and is part of the interval."""
     labels = read_volume(folder / "labels.mha")

@@ -36,6 +36,7 @@ def results(folder: Path) -> list[np.ndarray]:
     return [np.asarray(open_array(folder / f"{name}.zarr")[:]) for name in ("displacement", "standard_deviation", "mask")]
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_and_two_workers_give_what_one_gives(
     pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,7 +121,7 @@ def test_gels_of_other_stiffness_are_told_with_both_values() -> None:
     assert contradicted_experiments(replace(found, match=replace(found.match, status=Status.INTERRUPTED))) == ()
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
 def test_gels_of_one_stiffness_do_not_contradict_each_other(seed: int) -> None:
     found = identified_together(1.0, seed=seed)
     assert contradicted_experiments(found) == ()
