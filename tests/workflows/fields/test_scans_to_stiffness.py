@@ -31,6 +31,7 @@ def zones_of(folder: Path) -> list[dict[str, float]]:
     return list(json.loads((folder / "identification.json").read_text())["zones"])
 
 
+@pytest.mark.slow
 def test_moduli_of_outlined_zones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scans = scanned_liver(voxel_mm=0.8, element_size_mm=2.2, seed=2)
     written(tmp_path, scans)
