@@ -179,10 +179,9 @@ def told_alike(names: Sequence[str], theta: FloatArray, found: Uncertainty, larg
     k, slopes = len(names), young_and_poisson_slopes(theta)[0]
     logarithm, alike = np.log(young_and_poisson(theta)[0]), []
     for i in (i for i in range(k) if i != largest):
-        way = np.zeros((2, k))
-        way[:, i], way[:, largest] = slopes[:, i], -slopes[:, largest]
-        both = np.ix_(used := np.array([i, largest, k + i, k + largest]), used)
-        sd = float(np.sqrt(max(way.ravel()[used] @ found.covariance[both] @ way.ravel()[used], 0.0)))
+        used = np.array([i, largest, k + i, k + largest])
+        way = np.concatenate([[one[i], -one[largest]] for one in slopes])
+        sd = float(np.sqrt(max(float(way @ found.covariance[np.ix_(used, used)] @ way), 0.0)))
         if abs(logarithm[i] - logarithm[largest]) < 1.96 * sd < np.log(UNDETERMINED):  # what is less determined is told as such
             alike.append(names[i])
     return f"Young's modulus of {' and '.join(alike)} may be that of {names[largest]}" if alike else ""

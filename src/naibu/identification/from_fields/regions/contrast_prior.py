@@ -25,7 +25,7 @@ class ContrastPrior:
 
     largest: int
     sd: float = PRIOR_SD
-    name: str = "normal prior of contrasts"
+    name = "normal prior of contrasts"
 
     def value(self, theta: FloatArray) -> float:
         """Return the penalty."""

@@ -390,7 +390,7 @@ def _with_better_borders(
         return labels, point, 0
     theta = moderated(point.theta, criterion.prior(labels).largest)
     everywhere = _at(model, theta.reshape(2, -1)[:, labels].ravel(), point)
-    slopes: FloatArray = np.kron(np.eye(2), np.eye(graph.count)[:, movable]).astype(np.float64)
+    slopes = np.asarray(np.kron(np.eye(2), np.eye(graph.count)[:, movable]), dtype=float)
     quadratic = _scaled(model.linearised(everywhere).concentrated(slopes, ROUGH_TOLERANCE), criterion.scale)
     found, moves = border_moves(graph, labels, theta, quadratic, criterion.weight, movable)
     if not moves:
