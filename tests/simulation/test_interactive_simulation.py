@@ -676,7 +676,7 @@ def clamped_sphere() -> InteractiveSimulation:
     law = material(young_modulus=10.0, poisson_ratio=0.45)
     assembler = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, [law])
     body = FiniteElementBody.of(mesh, assembler, supported=np.flatnonzero(mesh.points[:, 2] < 1e-9), background=False)
-    tools = {"sphere": spherical_indenter((0.5 * size,) * 3, 6.0), "other": spherical_indenter((0.5 * size, 0.5 * size, 40.0), 4.0)}
+    tools = {"sphere": spherical_indenter((0.5 * size,) * 3, 5.9), "other": spherical_indenter((0.5 * size, 0.5 * size, 40.0), 4.0)}
     touched = InteractiveSimulation(body, tools)
     touched.take("sphere")
     roof = int(np.argmin(np.linalg.norm(mesh.points - [0.4 * size, 0.4 * size, size], axis=1)))
