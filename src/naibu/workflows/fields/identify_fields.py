@@ -311,7 +311,8 @@ def table_of_zones(result: FieldIdentification) -> Table:
             rows.append((name, e, *map(float, young[i]), nu, *map(float, poisson[i]), how[i], *map(float, exact[i])))
     rows += [(name, *NO_VALUE, NOT_DETERMINED, 0.0, np.inf) for name in result.left_out]
     moduli = (f"Young's modulus, {result.unit}", "95 % from", "to", "Poisson's ratio", "of which 95 % from", "up to")
-    columns = ("zone", *moduli, "Young's modulus is", "if the law is exact, 95 % from", "if the law is exact, to")
+    exactly = ("if the law is exact, Young's modulus 95 % from", "if the law is exact, Young's modulus to")
+    columns = ("zone", *moduli, "Young's modulus is", *exactly)
     return Table("Moduli", columns, tuple(rows))
 
 
