@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, length_of
 from naibu.core.errors import InputError
 
 ORTHOGONAL = 1e-6  # largest entry of R^T R - I of a matrix that is taken for a rotation
@@ -114,7 +114,7 @@ class RigidTransform:
 
 def rotation_matrix(vector: FloatArray) -> FloatArray:
     """Return the rotation matrix (3, 3) of a rotation vector, rad, by Rodrigues' formula."""
-    angle = float(np.linalg.norm(vector))
+    angle = length_of(vector)
     if angle == 0.0:
         return np.eye(3)
     k = _cross_matrix(vector / angle)

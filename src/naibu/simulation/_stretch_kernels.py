@@ -8,8 +8,8 @@ from naibu._numba.compilation import njit
 
 
 @njit(cache=True)
-def least_of_cells(positions, cells, inverse, watched):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Return the least principal stretch of cells (m, 4) and the number of that cell; `watched` and -1 where none is below that.
+def least_of_cells(positions, cells, inverse, watched, place):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the least principal stretch of cells (m, 4), and set the place (3,) of that cell; `watched` where none is below that.
 
     Of inverted cells it is negative. `inverse` (m, 3, 3) holds the inverses of the matrices of edges at rest.
     """
@@ -35,7 +35,12 @@ def least_of_cells(positions, cells, inverse, watched):  # type: ignore[no-untyp
         stretch = -stretch if volume < 0.0 else stretch
         if stretch < least:
             least, found = stretch, cell
-    return least, found
+    if found >= 0:
+        for a in range(3):
+            place[a] = 0.0
+            for k in range(4):
+                place[a] += 0.25 * positions[cells[found, k], a]
+    return least
 
 
 @njit(cache=True)

@@ -53,8 +53,8 @@ class CrushedCells:
         watched : float
             Stretches from here on do not count: it is returned where there are no others, with the origin.
         """
-        least, cell = least_of_cells(positions, self.cells[part], self.inverse[part], watched)
-        return float(least), positions[self.cells[part][cell]].mean(axis=0) if cell >= 0 else np.zeros(3)
+        place = np.zeros(3)
+        return float(least_of_cells(positions, self.cells[part], self.inverse[part], watched, place)), place
 
 
 def _edges(points: FloatArray, cells: IntArray) -> FloatArray:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, length_of
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.simulation.crushed_cells import CrushedCells
 from naibu.simulation.interactive_bodies import InteractiveBody
@@ -150,10 +150,10 @@ class HeldTool:
 
     def _advance(self, centre: FloatArray, way: FloatArray) -> float:
         """Return how far a way leads against the body, mm: along the force on it, or to the cell that is crushed most."""
-        size, to_cell = float(np.linalg.norm(self._force)), self._place - centre
+        size, to_cell = length_of(self._force), self._place - centre
         if size == 0.0:
             return 0.0
         along = float(way @ self._force) / size
-        if along < -BACK * float(np.linalg.norm(way)):
+        if along < -BACK * length_of(way):
             return 0.0
-        return max(along, float(way @ to_cell) / max(float(np.linalg.norm(to_cell)), 1e-9))
+        return max(along, float(way @ to_cell) / max(length_of(to_cell), 1e-9))

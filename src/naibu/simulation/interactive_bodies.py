@@ -156,7 +156,9 @@ class LatticeBody:
 
     def grip_velocity(self, velocity: FloatArray) -> FloatArray:
         """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
-        return np.stack([np.zeros(3), velocity])
+        velocities = np.zeros((2, 3))
+        velocities[1] = velocity
+        return velocities
 
     def step(
         self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float
@@ -349,7 +351,9 @@ class FiniteElementBody:
 
     def grip_velocity(self, velocity: FloatArray) -> FloatArray:
         """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
-        return np.stack([np.zeros(3), velocity])
+        velocities = np.zeros((2, 3))
+        velocities[1] = velocity
+        return velocities
 
     def step(
         self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float

@@ -76,6 +76,7 @@ class InteractiveSimulation:
     _surface: IntArray = field(init=False)
     _low: FloatArray = field(init=False)  # corners of the box around the body at rest, mm
     _high: FloatArray = field(init=False)
+    _extent: float = field(init=False)
     _held: HeldTool = field(init=False)
     _cutting: BackgroundCut | None = field(init=False, default=None)
     _next: str | None = field(init=False, default=None)  # tool that is taken when the one in play has left the body
@@ -104,7 +105,7 @@ class InteractiveSimulation:
     @property
     def extent_mm(self) -> float:
         """Largest edge of the box around the body at rest, mm."""
-        return float((self._high - self._low).max())
+        return self._extent
 
     @property
     def fastest_mm_s(self) -> float:
@@ -344,7 +345,9 @@ class InteractiveSimulation:
             self._last = replace(self._last, number=self._last.number + 1, failed="", under_way=True)
             return self._last
         way, self._failures = centre - self._centre, 0
-        self._centre, self._rotation = centre, rotation_matrix(duration * spin) @ self._rotation
+        self._centre = centre
+        if spin.any():
+            self._rotation = rotation_matrix(duration * spin) @ self._rotation
         force = forces.indenters[:, -1].mean(axis=0) if self._tool else np.zeros(3)
         pull = forces.bodies[:, 1].mean(axis=0) if self._gripped >= 0 else np.zeros(3)
         self._last = self._frame(self._last.number + 1, self._last.time_s + duration, force, pull, "")
@@ -401,6 +404,7 @@ class InteractiveSimulation:
             self._session.close()
         self.body, self._surface = body, np.unique(body.faces)
         self._low, self._high = body.points.min(axis=0), body.points.max(axis=0)
+        self._extent = float((self._high - self._low).max())
         self._nodes, self._gripped = NO_NODES, -1
         self._held = HeldTool.by(body, self.frame_s, FRAME_S)
         self._session = body.session()
@@ -431,7 +435,7 @@ class InteractiveSimulation:
 
     def _within(self, position: FloatArray) -> FloatArray:
         middle, reach = 0.5 * (self._low + self._high), REACH * self.extent_mm
-        return np.asarray(np.clip(position, middle - reach, middle + reach))
+        return np.asarray(np.minimum(np.maximum(position, middle - reach), middle + reach))
 
     def _keep(self) -> None:
         self._kept.append(KeptState(self.body, self._session.state(), self._last.time_s, self._tool, self._centre, self._rotation))

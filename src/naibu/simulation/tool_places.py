@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import FloatArray, IntArray, length_of
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 
 THROUGH = 0.5  # of the thinnest half extent of a tool
@@ -50,13 +50,13 @@ def placed(tool: RigidIndenter, centre: FloatArray, rotation: FloatArray | None 
 def towards(start: FloatArray, target: FloatArray, reach: float) -> FloatArray:
     """Return the point on the way to a target that is at most `reach` away from the start."""
     way = target - start
-    length = float(np.linalg.norm(way))
+    length = length_of(way)
     return np.asarray(target if length <= reach else start + way * (reach / length), dtype=float)
 
 
 def turning_towards(rotation: FloatArray, wanted: FloatArray, duration_s: float) -> FloatArray:
     """Return the angular velocity (3,), rad/s, at which a tool turns to a rotation (3, 3) in a time, s, or in more at its fastest."""
-    if np.linalg.norm(wanted - rotation) <= 2.0**0.5 * LEAST_TURN:  # the norm is 8^(1/2) sin(angle / 2)
+    if wanted is rotation or np.linalg.norm(wanted - rotation) <= 2.0**0.5 * LEAST_TURN:  # the norm is 8^(1/2) sin(angle / 2)
         return np.zeros(3)
     left = Rotation.from_matrix(wanted @ rotation.T).as_rotvec()
     return np.asarray(left / max(duration_s, float(np.linalg.norm(left)) / TURNING))

@@ -182,7 +182,9 @@ def _extended(values: AnyArray, rows: int, copies: IntArray) -> AnyArray:
 def forest_pieces(forest: BisectionForest) -> IntArray:
     """Return the number of the piece of every leaf (n_cells,), in the order of `BisectionForest.leaf_mesh`, the largest volume first."""
     label, count = _labels(forest)
-    cells = np.sort(forest.leaves())
+    cells = forest.leaves_in_order()
+    if count == 1:
+        return np.zeros(len(cells), dtype=np.int64)
     rank = np.empty(count, dtype=np.int64)
     rank[np.argsort(-np.bincount(label[cells], forest.volumes(cells)), kind="stable")] = np.arange(count)
     return np.asarray(rank[label[cells]])

@@ -143,7 +143,7 @@ def cut_volume(
         )
     else:
         forest = forest.copied()
-    before = np.sort(forest.leaves())
+    before = forest.leaves_in_order()
     found = cut_forest(forest, blade, distance_mm, positions=where, least_angle_deg=least_angle_deg, earlier=earlier)
     return _described(mesh, forest, found, before, where)
 

@@ -392,25 +392,3 @@ def around_node(cells, nodes, k, v, found):  # type: ignore[no-untyped-def]  # p
     for i in range(n):
         cells[found[i], MARK] = 0
     return n if fits else -1
-
-
-@njit(cache=True)
-def neighbours_by_faces(cells, order, faces, k):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Set the neighbours of cells from the sorted order (m k,) of their faces (m k, k - 1); return a face of three cells, or -1."""
-    i = 0
-    while i < len(order):
-        j = i + 1
-        while j < len(order):
-            same = True
-            for a in range(k - 1):
-                same = same and faces[order[i], a] == faces[order[j], a]
-            if not same:
-                break
-            j += 1
-        if j - i > 2:
-            return order[i]
-        if j - i == 2:
-            f, g = order[i], order[i + 1]
-            cells[f // k, 4 + f % k], cells[g // k, 4 + g % k] = g // k, f // k
-        i = j
-    return -1

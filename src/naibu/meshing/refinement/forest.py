@@ -15,7 +15,7 @@ from naibu.core.mesh import Mesh
 from naibu.meshing.refinement import _forest_kernels as kernels
 from naibu.meshing.refinement._forest_kernels import CHILD, FLIPPED, LEAF, LEVEL, PARENT, REGION, TAG
 from naibu.meshing.refinement.cut_front import NO_FRONT, followed_front
-from naibu.meshing.refinement.root_cells import join_roots, require_volumes
+from naibu.meshing.refinement.root_cells import determinants, join_roots, require_volumes
 from naibu.meshing.refinement.tagging import tagged
 
 _Arrays = tuple[Int32Array, FloatArray, Int32Array, Int32Array, Int32Array, IntArray]
@@ -130,8 +130,7 @@ class BisectionForest:
         cells = np.zeros((2 * m + 1024, kernels.WIDTH), dtype=np.int32)
         cells[:m, :k], cells[:m, 4:8], cells[:m, PARENT], cells[:m, CHILD] = order, -1, -1, LEAF
         cells[:m, TAG], cells[:m, REGION], cells[:m, kernels.PLACE] = tags, mesh.regions, np.arange(m)
-        turned = mesh.points[order]
-        cells[:m, FLIPPED] = np.linalg.det(turned[:, 1:] - turned[:, :1]) < 0.0
+        cells[:m, FLIPPED] = determinants(mesh.points, order) < 0.0
         nodes = np.full((2 * n + 1024, 4), -1, dtype=np.int32)
         nodes[:n, 2] = 0
         nodes[cells[:m, :k].ravel(), 3] = np.repeat(np.arange(m), k)
@@ -218,15 +217,18 @@ class BisectionForest:
         """Return the numbers (n_cells,) of all leaves, in no order."""
         return self._arrays[4][: self.n_cells].astype(np.int64)
 
+    def leaves_in_order(self) -> IntArray:
+        """Return the numbers (n_cells,) of all leaves, ascending."""
+        return np.flatnonzero(self.children == LEAF).astype(np.int64, copy=False)
+
     def volumes(self, cells: ArrayLike) -> FloatArray:
         """Return the volumes (mm^3), or areas (mm^2), of cells (c,)."""
-        corners = self.points[self.simplices[self._known(cells)]]
-        determinants = np.abs(np.linalg.det(corners[:, 1:] - corners[:, :1]))
-        return np.asarray(determinants / (2.0 if self.dimension == 2 else 6.0))
+        sizes = np.abs(determinants(self.points, self.simplices[self._known(cells)]))
+        return np.asarray(sizes / (2.0 if self.dimension == 2 else 6.0))
 
     def leaf_mesh(self) -> LeafMesh:
         """Return the leaves as a mesh, sorted by their numbers; takes a time in proportion to its size."""
-        cells = np.sort(self.leaves())
+        cells = self.leaves_in_order()
         nodes = np.flatnonzero(self.node_used)
         number = np.full(self.node_rows, -1, dtype=np.int64)
         number[nodes] = np.arange(len(nodes))
@@ -337,7 +339,7 @@ class BisectionForest:
 
     def boundary_faces(self) -> tuple[IntArray, IntArray]:
         """Return cell and place (f, 2) of the boundary faces of leaves, and their markers (f,); faces lie opposite to the vertex there."""
-        cells = np.sort(self.leaves())
+        cells = self.leaves_in_order()
         across = self.neighbours[cells]
         row, place = np.nonzero(across < 0)
         return np.stack([cells[row], place], axis=1), (-1 - across[row, place]).astype(np.int64)

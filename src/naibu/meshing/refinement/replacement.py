@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import FloatArray, IntArray, as_points
+from naibu.core.arrays import IntArray, as_points
 from naibu.core.errors import InputError
 from naibu.meshing.refinement import _forest_kernels as kernels
 from naibu.meshing.refinement._forest_kernels import CHILD, FLIPPED, FREE, LEAF, LEVEL, MARK, PARENT, PLACE, REGION, TAG
 from naibu.meshing.refinement.forest import BisectionForest
+from naibu.meshing.refinement.root_cells import determinants
 from naibu.meshing.refinement.tagging import tagged
 
 
@@ -78,7 +79,7 @@ def replaced_cells(
     old = np.unique(np.asarray(cells, dtype=np.int64))
     new = np.asarray(simplices, dtype=np.int64).reshape(-1, forest.dimension + 1)
     _require_leaves(forest, old)
-    volumes = _signed(forest.points, new)
+    volumes = determinants(forest.points, new)
     if not (volumes > 0.0).all():
         bad = int(np.argmin(volumes))
         raise InputError(f"simplices[{bad}] has the volume {volumes[bad]:g}; give its vertices in positive order")
@@ -97,7 +98,7 @@ def replaced_cells(
     table[numbers, TAG] = tags
     table[numbers, LEVEL] = np.where(origin >= 0, forest.levels[origin], levels)
     table[numbers, REGION] = forest.regions[np.where(origin >= 0, origin, old[0])] if regions is None else np.asarray(regions)
-    table[numbers, FLIPPED] = _signed(forest.points, order) < 0.0
+    table[numbers, FLIPPED] = determinants(forest.points, order) < 0.0
     table[numbers, 4 : 4 + new.shape[1]] = -1 - marker
     for (one, i), (two, j) in inner:
         table[numbers[one], 4 + place_of[one, i]], table[numbers[two], 4 + place_of[two, j]] = numbers[two], numbers[one]
@@ -120,11 +121,6 @@ def replaced_cells(
 
 
 Face = tuple[int, int]  # a cell and the place of the vertex opposite to the face
-
-
-def _signed(points: FloatArray, cells: IntArray) -> FloatArray:
-    corners = points[cells]
-    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))
 
 
 def _require_leaves(forest: BisectionForest, cells: IntArray) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, Int32Array
+from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
-from naibu.meshing.refinement import _forest_kernels as kernels
+from naibu.meshing.refinement import _root_kernels as kernels
 
 
 def require_volumes(mesh: Mesh) -> None:
@@ -20,7 +20,7 @@ def require_volumes(mesh: Mesh) -> None:
     """
     if mesh.cell_type not in ("triangle", "tetra"):
         raise InputError(f"a bisection forest has triangles or linear tetrahedra, not {mesh.cell_type!r} cells; split the cells first")
-    size = _determinants(mesh.points[mesh.cells])
+    size = determinants(mesh.points, mesh.cells)
     if not (size != 0.0).all():
         bad = int(np.argmin(np.abs(size)))
         raise InputError(f"cell {bad} of {mesh.n_cells} has no volume; remove it, or move its nodes apart")
@@ -34,20 +34,14 @@ def join_roots(cells: Int32Array, k: int, mesh: Mesh) -> None:
     InputError
         Three cells share a face, or two cells lie on the same side of the one that they share.
     """
-    others = np.array([[j for j in range(k) if j != i] for i in range(k)])
-    faces = np.sort(cells[:, others].reshape(-1, k - 1), axis=1)
-    bad = int(kernels.neighbours_by_faces(cells, np.lexsort(faces.T), faces, k))
+    faces = np.empty((len(cells) * k, k - 1), dtype=np.int64)
+    kernels.faces_of(cells, k, faces)
+    bad = int(kernels.neighbours_by_faces(cells, faces, np.zeros(mesh.n_points + 1, dtype=np.int64), np.empty(len(faces), dtype=np.int64)))
     if bad >= 0:
         raise InputError(f"three cells share the face with nodes {faces[bad].tolist()}; at most two can: remove duplicate cells")
-    for place in range(k):
-        own = np.flatnonzero(cells[:, 4 + place] > np.arange(len(cells)))
-        across = cells[own, 4 + place]
-        opposite = cells[across, np.argmax(cells[across, 4 : 4 + k] == own[:, None], axis=1)]
-        here, there = mesh.points[cells[own, :k]], mesh.points[cells[own, :k]]
-        there[:, place] = mesh.points[opposite]
-        overlapping = np.flatnonzero(np.sign(_determinants(here)) == np.sign(_determinants(there)))
-        if len(overlapping):
-            raise _overlap(cells[:, :k], int(own[overlapping[0]]), int(across[overlapping[0]]))
+    one, two = kernels.overlapping(mesh.points, cells, k, np.empty(k, dtype=np.int64))
+    if one >= 0:
+        raise _overlap(cells[:, :k], int(one), int(two))
 
 
 def _overlap(corners: Int32Array, one: int, two: int) -> InputError:
@@ -59,5 +53,16 @@ def _overlap(corners: Int32Array, one: int, two: int) -> InputError:
     )
 
 
-def _determinants(corners: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+def determinants(points: FloatArray, cells: IntArray | Int32Array) -> FloatArray:
+    """Return the determinants (m,) of the edges from the first vertex of each cell: two or six times its size, with the sign of its order.
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, d)
+        mm.
+    cells : ndarray, shape (m, d + 1)
+        Triangles or tetrahedra.
+    """
+    out = np.empty(len(cells))
+    kernels.determinants(np.ascontiguousarray(points), np.ascontiguousarray(cells, dtype=np.int64), out)
+    return out

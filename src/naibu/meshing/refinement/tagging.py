@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu.core.arrays import FloatArray, Int8Array, IntArray
+from naibu.meshing.refinement import _root_kernels as kernels
 
 ADJACENT, OPPOSITE, MIXED, PLANAR = 3, 4, 5, 6
 _EDGES = {3: np.array([[0, 1], [0, 2], [1, 2]]), 4: np.array([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])}
@@ -42,15 +43,11 @@ def tagged(points: FloatArray, cells: IntArray) -> tuple[IntArray, Int8Array]:
 
 
 def _edge_ranks(points: FloatArray, cells: IntArray) -> IntArray:
-    """Return the place of every edge of every cell (m, e) among all edges of the mesh, the longest first, without ties."""
-    ends = np.sort(cells[:, _EDGES[cells.shape[1]]], axis=2)
-    keys = ends[..., 0] * len(points) + ends[..., 1]
-    unique, number = np.unique(keys, return_inverse=True)
-    first, second = unique // len(points), unique % len(points)
-    lengths = np.linalg.norm(points[second] - points[first], axis=1)
-    rank = np.empty(len(unique), dtype=np.int64)
-    rank[np.lexsort((unique, -np.round(lengths / (_TIE * lengths.max()))))] = np.arange(len(unique))
-    return np.asarray(rank[number.reshape(keys.shape)])
+    """Return the place of every edge among those of its cell (m, e), the longest first; ties are decided alike in all cells."""
+    edges = _EDGES[cells.shape[1]]
+    ranks = np.empty((len(cells), len(edges)), dtype=np.int64)
+    kernels.edge_ranks(np.ascontiguousarray(points), np.ascontiguousarray(cells, dtype=np.int64), edges, _TIE, np.empty(ranks.shape), ranks)
+    return ranks
 
 
 def _triangles(cells: IntArray, ranks: IntArray) -> tuple[IntArray, Int8Array]:

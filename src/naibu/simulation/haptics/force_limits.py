@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, require_positive
+from naibu.core.arrays import FloatArray, length_of, require_positive
 
 MOST_OPEN = 256  # answers whose forces are remembered
 TAKEN_BACK = 0.01  # of the bound, which damping gets back where nothing is left: at nothing no force could begin that takes energy in
@@ -55,7 +55,7 @@ class ForceLimits:
 
     def within_magnitude(self, force: FloatArray) -> FloatArray:
         """Return a force (3,), mN, shortened to the largest magnitude."""
-        size = float(np.linalg.norm(force))
+        size = length_of(force)
         return force if size <= self.force_mn else np.asarray(force * (self.force_mn / size))
 
 
@@ -87,12 +87,12 @@ class PassivityController:
         No force exceeds that of the coupling when it has stored what is left, and the energy that passes while the force is taken back at
         its limited rate is counted, too. Where nothing is left, a damping takes back what was handed out, and a little more.
         """
-        speed = float(np.linalg.norm(velocity))
+        speed = length_of(velocity)
         left = self.absorbed + self.limits.energy_mn_mm
         if left <= 0.0:
             lack = TAKEN_BACK * self.limits.energy_mn_mm - left
             return np.asarray(-min(lack / (speed * step_s), self.limits.damping * speed) * velocity / speed) if speed > 0.0 else np.zeros(3)
-        size = float(np.linalg.norm(force))
+        size = length_of(force)
         kept = min(1.0, np.sqrt(2.0 * self.stiffness * left) / size) if size > 0.0 else 1.0
         along = kept * float(force @ velocity) / speed if speed > 0.0 else 0.0
         if along > 0.0:
