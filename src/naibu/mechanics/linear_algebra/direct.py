@@ -70,7 +70,7 @@ MKL_MB = 400  # of address space for the libraries, twice of what they took here
 MKL_THREAD_MB = 80  # for the stack and the heap of a thread
 SINGULAR = {np.float64: 1e14, np.float32: 1e9}  # growth of a solution, beyond which it is rounding
 _NO_MEMORY = -2  # PARDISO's number of this error
-_BY_COLUMNS, _IN_SEQUENCE = 0, 1  # how PARDISO's threads share the solution with a factor (its parameter 24): the right sides among them, or not
+_BY_COLUMNS, _IN_SEQUENCE = 0, 1  # how threads share a solution, its parameter 24: the right sides among them, or not at all
 
 
 class PardisoSolver:
