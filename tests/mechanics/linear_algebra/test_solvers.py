@@ -213,6 +213,23 @@ def test_pardiso_may_factorize_with_fewer_threads_than_before():
 
 
 @needs_pardiso
+@needs_pardiso
+@pytest.mark.parametrize("symmetric", [True, False])
+def test_solutions_on_two_threads_do_not_depend_on_which_ends_first(symmetric):
+    block, constrained = body(11)
+    matrix = stiffness(mesh=block, constrained=constrained)
+    right = np.random.default_rng(3).standard_normal((matrix.shape[0], 40))
+    direct.use_threads(2)
+    try:
+        solver = PardisoSolver(matrix, symmetric=symmetric)
+        for columns in (0, slice(0, 2), slice(0, 40)):
+            found = {solver.factorize(matrix).solve(right[:, columns]).tobytes()}
+            found |= {solver.solve(right[:, columns]).tobytes() for _ in range(60 if columns == 0 else 3)}
+            assert len(found) == 1
+    finally:
+        direct.use_threads(0)
+
+
 def test_recycled_cholesky_serves_other_tangents_and_many_columns():
     made = []
 

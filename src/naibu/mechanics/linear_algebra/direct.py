@@ -70,6 +70,7 @@ MKL_MB = 400  # of address space for the libraries, twice of what they took here
 MKL_THREAD_MB = 80  # for the stack and the heap of a thread
 SINGULAR = {np.float64: 1e14, np.float32: 1e9}  # growth of a solution, beyond which it is rounding
 _NO_MEMORY = -2  # PARDISO's number of this error
+_BY_COLUMNS, _IN_SEQUENCE = 0, 1  # how threads share a solution, its parameter 24: the right sides among them, or not at all
 
 
 class PardisoSolver:
@@ -179,6 +180,8 @@ class PardisoSolver:
     def solve(self, b: FloatArray) -> FloatArray:
         """Return x for b of shape (n,) or (n, r)."""
         columns = 1 if b.ndim == 1 else b.shape[1]
+        # on several threads one column would be solved with contributions added in the order in which threads happen to finish them
+        self._parameters[24] = _IN_SEQUENCE if columns == 1 else _BY_COLUMNS
         rhs: AnyFloatArray = np.asarray(b, dtype=self._float, order="F")
         x: AnyFloatArray = np.zeros(rhs.shape, dtype=self._float, order="F")
         error = self._call(33, rhs, x, columns)
