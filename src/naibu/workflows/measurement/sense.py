@@ -280,9 +280,14 @@ def sense_pair(
     """
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     began = time.perf_counter()
-    measured = measure_displacement(
-        pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
-    )
+    try:
+        measured = measure_displacement(
+            pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
+        )
+    except InputError as error:  # that they were brought onto one grid may be why
+        if not pair.notes:
+            raise
+        raise InputError(". ".join([str(error), *pair.notes])) from error
     measured = replace(measured, warnings=(*pair.notes, *measured.warnings))
     return recorded(pair, measured, time.perf_counter() - began, folder)
 
