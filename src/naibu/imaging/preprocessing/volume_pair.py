@@ -77,8 +77,8 @@ def on_reference_grid(reference: Volume, deformed: Volume) -> tuple[Volume, str]
     Raises
     ------
     InputError
-        As many voxels of another spacing, or spacings that differ by a power of ten, of which one is likely to be wrong; volumes that do not
-        overlap.
+        As many voxels of another spacing, or spacings that differ by a power of ten, of which one is likely to be wrong.
+        No overlap.
     """
     different = reference.grid_difference(deformed)
     if not different:
