@@ -52,7 +52,7 @@ def sense(
     reference
         Scan of the reference configuration: MetaImage, NIfTI, NRRD, TIFF stack, HDF5, Zarr, or a folder with a DICOM series.
     deformed
-        Scan of the deformed configuration, on the same grid.
+        Scan of the deformed configuration; on another grid it is resampled to that of the reference, by the positions that both state.
     method
         Digital volume correlation regularised by mechanics (default), or a classic method.
     out
@@ -156,7 +156,7 @@ def compare_methods(
     reference
         Scan of the reference configuration.
     deformed
-        Scan of the deformed configuration, on the same grid.
+        Scan of the deformed configuration; on another grid it is resampled to that of the reference, by the positions that both state.
     method
         Use only this method. May be repeated.
     out

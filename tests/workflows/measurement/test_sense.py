@@ -299,3 +299,46 @@ def test_methods_are_told_and_written_one_after_the_other(folder: Path, tmp_path
     assert f"Nearest to the truth by the 95th percentile of the error: {min(error, key=error.get)}" in result.page.read_text(
         encoding="utf-8"
     )
+
+
+def _textured(points: Array) -> Array:
+    """Density at points (..., 3), mm, of a soft-edged ball of radius 18 mm with texture, in closed form."""
+    waves = np.random.default_rng(5).normal(0.0, 0.45, (40, 3))
+    phases = np.random.default_rng(6).uniform(0.0, 2.0 * np.pi, 40)
+    texture = np.cos(points @ waves.T + phases).sum(axis=-1) / np.sqrt(40.0)
+    return np.asarray((1000.0 + 300.0 * texture) / (1.0 + np.exp((np.linalg.norm(points, axis=-1) - 18.0) / 0.6)))
+
+
+def test_a_deformed_scan_on_another_grid_is_resampled_and_said(tmp_path: Path) -> None:
+    stretch, shift = np.diag([0.02, 0.01, -0.05]), np.array([1.0, -0.7, 1.5])
+    before = Volume.from_array(np.zeros((30, 40, 44)), spacing_mm=(1.2, 1.2, 1.8), origin_mm=(-26.0, -24.0, -26.0))
+    flipped = Volume.from_array(
+        np.zeros((40, 44, 46)), spacing_mm=(1.1, 1.25, 1.3), origin_mm=(27.0, 26.0, -25.0), direction=np.diag([-1.0, -1.0, 1.0])
+    )
+    write_volume(tmp_path / "before.mha", before.with_values(_textured(before.positions()).astype(np.float32)))
+    back = np.linalg.inv(np.eye(3) + stretch)
+    write_volume(tmp_path / "after.nii.gz", flipped.with_values(_textured((flipped.positions() - shift) @ back).astype(np.float32)))
+    pair = read_pair(tmp_path / "before.mha", tmp_path / "after.nii.gz")
+    run = sense_pair(pair)
+    field = run.measured.displacement
+    answered = run.measured.mask & field.valid
+    error = np.linalg.norm(field.vectors - before.positions() @ stretch - shift, axis=-1)[answered]
+    assert answered.sum() > 0.9 * run.measured.mask.sum() and np.median(error) < 0.1
+    assert "resampled to the grid of the reference" in run.measured.warnings[0]
+
+
+def test_values_of_coinciding_voxels_are_those_that_were_stored(tmp_path: Path) -> None:
+    before, after, *_ = squeezed_ball(seed=3)
+    write_volume(tmp_path / "before.mha", before)
+    turned = replace(
+        after, values=np.ascontiguousarray(after.values[3:, ::-1, ::-1]), direction=np.diag([-1.0, -1.0, 1.0]),
+        origin_mm=after.to_physical([after.shape[2] - 1, after.shape[1] - 1, 3]),
+    )  # fmt: skip
+    write_volume(tmp_path / "turned.mha", turned)
+    pair = read_pair(tmp_path / "before.mha", tmp_path / "turned.mha")
+    np.testing.assert_array_equal(pair.deformed.values[3:], after.values[3:])
+    assert np.isnan(pair.deformed.values[:3]).all() and "of its voxels lie outside" in pair.notes[0]
+    stretched = Volume.from_array(after.values, spacing_mm=before.spacing_mm * [1.0, 1.0, 0.9])
+    write_volume(tmp_path / "stretched.mha", stretched)
+    with pytest.raises(InputError, match="as many voxels, but their voxel spacings differ"):
+        read_pair(tmp_path / "before.mha", tmp_path / "stretched.mha")

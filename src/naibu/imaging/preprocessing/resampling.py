@@ -20,6 +20,7 @@ from naibu.imaging.preprocessing._interpolation_kernels import EDGE, sample, sam
 from naibu.imaging.preprocessing.filters import smoothed
 
 Interpolation = Literal["linear", "cubic"]
+COINCIDENT = 1e-3  # largest distance, in voxels, of voxels that are taken for the same: coordinates in headers are rounded
 
 
 def with_slices_between(volume: Volume, count: int = 1) -> Volume:
@@ -165,6 +166,28 @@ def resampled_to_grid(
     return replace(grid, values=out)
 
 
+def on_voxels_of(volume: Volume, grid: Volume) -> Volume:
+    """Return the values of a volume at the voxels of another, NaN where they lie outside of it.
+
+    Where the voxels of both coincide, as after a crop or with axes that are flipped or in another order, values are those that were stored;
+    elsewhere they are interpolated by cubic B-splines, or linearly where some are unknown, after a Gaussian has removed what would alias.
+
+    Raises
+    ------
+    InputError
+        No voxel of the grid lies inside the volume.
+    """
+    matrix, shift = _index_map(volume, grid, None)
+    if (matrix == np.rint(matrix)).all() and (shift == np.rint(shift)).all():
+        return resampled_to_grid(volume, grid)
+    values = np.asarray(volume.values, dtype=_real(volume.values))
+    unknown = bool(np.isnan(values).any())
+    ratio = np.abs(matrix).max(axis=1)
+    if (ratio > 1.0).any() and not unknown:
+        values = smoothed(values.astype(np.float32), 0.5 * np.sqrt(np.maximum(ratio**2 - 1.0, 0.0))).astype(values.dtype)
+    return resampled_to_grid(volume.with_values(values), grid, interpolation="linear" if unknown else "cubic")
+
+
 def covered(volume: Volume, grid: Volume, *, through: Callable[[FloatArray], FloatArray] | None = None) -> BoolArray:
     """Return which voxels (nz, ny, nx) of a grid lie inside a volume after the map `through` (see `resampled_to_grid`)."""
     matrix, shift = _index_map(volume, grid, through)
@@ -275,7 +298,12 @@ def _index_map(volume: Volume, grid: Volume, through: Callable[[FloatArray], Flo
     """Return the affine map from indices of a grid to indices of a volume, both along x, y, z."""
     corners = grid.to_physical(np.vstack([np.zeros(3), np.eye(3)]))
     index = volume.to_index(corners if through is None else through(corners))
-    return np.ascontiguousarray((index[1:] - index[0]).T), index[0]
+    matrix, shift = np.ascontiguousarray((index[1:] - index[0]).T), index[0]
+    if through is None:
+        whole, offset = np.rint(matrix), np.rint(shift)
+        if np.abs(matrix - whole).max() * max(grid.shape) < COINCIDENT and np.abs(shift - offset).max() < COINCIDENT:
+            return whole, offset
+    return matrix, shift
 
 
 def _real(values: AnyArray) -> type[np.floating]:

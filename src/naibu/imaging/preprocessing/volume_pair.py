@@ -6,8 +6,11 @@ import numpy as np
 
 from naibu.core.arrays import AnyArray, AnyFloatArray, Float32Array, FloatArray
 from naibu.core.errors import InputError
-from naibu.core.volume import Volume
+from naibu.core.volume import NEARLY, Volume
 from naibu.imaging.preprocessing.field_of_view import Box
+from naibu.imaging.preprocessing.resampling import covered, on_voxels_of
+
+LOST_SHARE = 0.005  # of the reference's voxels, from which the part outside of the deformed scan is told
 
 
 def intensity_pair(reference: Volume, deformed: Volume) -> tuple[Float32Array, Float32Array]:
@@ -59,6 +62,43 @@ def require_one_grid(reference: Volume, deformed: Volume) -> None:
             f"reference and deformed lie on different grids: {different}; resample one to the grid of the other (in Python by "
             f"naibu.imaging.resampled_to_grid).{units}"
         )
+
+
+def on_reference_grid(reference: Volume, deformed: Volume) -> tuple[Volume, str]:
+    """Return the deformed volume at the voxels of the reference, by the positions that both state, and a sentence that says so.
+
+    Returns
+    -------
+    deformed : Volume
+        NaN where a voxel lies outside of the deformed volume; itself where it is on the grid of the reference.
+    told : str
+        What distinguishes the grids, and what was done; empty for one grid.
+
+    Raises
+    ------
+    InputError
+        As many voxels of another spacing, or spacings that differ by a power of ten, of which one is likely to be wrong.
+        No overlap.
+    """
+    different = reference.grid_difference(deformed)
+    if not different:
+        return deformed, ""
+    ratio = deformed.spacing_mm / reference.spacing_mm
+    parallel = np.abs(reference.direction - deformed.direction).max() < NEARLY
+    if parallel and reference.shape == deformed.shape and np.abs(ratio - 1.0).max() > NEARLY and not _power_of_ten(ratio):
+        raise InputError(
+            f"reference and deformed have as many voxels, but {different}: one of the files is likely to state a wrong spacing, or other "
+            "units; correct it, give spacing_mm for both, or resample the deformed scan to the grid of the reference"
+        )
+    if _power_of_ten(ratio):
+        require_one_grid(reference, deformed)
+    moved = on_voxels_of(deformed, reference)
+    outside = 1.0 - float(covered(deformed, reference).mean())
+    lost = f"; {100.0 * outside:.0f} % of its voxels lie outside of the deformed scan" if outside > LOST_SHARE else ""
+    return moved, (
+        f"the deformed scan lies on another grid ({different}): it was resampled to the grid of the reference by the positions that both "
+        f"files state{lost}. If one of them states a wrong position, all displacements are wrong by the same shift"
+    )
 
 
 def require_contrast(volume: Volume, name: str) -> None:

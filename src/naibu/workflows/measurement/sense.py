@@ -22,6 +22,8 @@ from naibu.core.volume import Volume
 from naibu.imaging.displacement.accuracy import check_point_errors, end_point_error, intensity_rms
 from naibu.imaging.displacement.strain import folded_fraction, green_lagrange_strain_of
 from naibu.imaging.measure_displacement import FACTS, MeasuredDisplacement, Method, measure_displacement
+from naibu.imaging.preprocessing.resampling import on_voxels_of
+from naibu.imaging.preprocessing.volume_pair import on_reference_grid
 from naibu.io.displacement_fields import write_field
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import input_record
@@ -68,7 +70,10 @@ FIGURES = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pair:
-    """Two volumes on one grid, the mask of the object in the reference, and true displacements where they are known."""
+    """Two volumes on one grid, the mask of the object in the reference, and true displacements where they are known.
+
+    `notes` are sentences on what was done to bring them onto one grid.
+    """
 
     reference: Volume
     deformed: Volume
@@ -78,6 +83,7 @@ class Pair:
     truth: FloatArray | None = None
     check_points: tuple[FloatArray, FloatArray] | None = None
     deformed_mask: BoolArray | None = None
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,7 +131,8 @@ def read_pair(
     Parameters
     ----------
     reference, deformed : path-like
-        Volumes before and after the deformation (see `naibu.io.images.read_volume`); NaN where they were not measured.
+        Volumes before and after the deformation (see `naibu.io.images.read_volume`); NaN where they were not measured. The deformed one is
+        resampled to the grid of the reference where it lies on another, and `Pair.notes` says so.
     mask : path-like, optional
         Volume on the grid of the reference, not zero in the object.
     deformed_mask : path-like, optional
@@ -141,7 +148,7 @@ def read_pair(
     Raises
     ------
     InputError
-        A file that cannot be read, or a mask or truth on another grid.
+        A file that cannot be read, a mask or truth on another grid, or scans whose grids contradict each other.
     """
     require_lengths(spacing_mm=spacing_mm)
     a, b = (read_volume(p, spacing_mm=spacing_mm, missing=True) for p in (reference, deformed))
@@ -151,6 +158,9 @@ def read_pair(
             m = read_volume(path, spacing_mm=spacing_mm)
             _same(m, grid, Path(path), Path(scan))
             masks[k] = np.asarray(m.values != 0)
+    moved, told = on_reference_grid(a, b)
+    if told and masks[1] is not None:
+        masks[1] = np.asarray(on_voxels_of(b.with_values(masks[1]), a).values > 0.5)
     known = None
     if truth is not None:
         known, grid = read_displacement(truth)
@@ -159,7 +169,7 @@ def read_pair(
     files = {"reference": reference, "deformed": deformed, "mask": mask, "deformed_mask": deformed_mask, "truth": truth}
     tables = dict(zip(("reference_check_points", "deformed_check_points"), check_points or (), strict=False))
     names = (Path(reference).name, Path(deformed).name)
-    return Pair(a, b, masks[0], input_record(files | tables), names, known, points, masks[1])
+    return Pair(a, moved, masks[0], input_record(files | tables), names, known, points, masks[1], (told,) if told else ())
 
 
 def common_points(reference: str | os.PathLike[str], deformed: str | os.PathLike[str]) -> tuple[FloatArray, FloatArray]:
@@ -199,7 +209,8 @@ def sense(
     Parameters
     ----------
     reference, deformed : path-like
-        Volumes before and after the deformation, on one grid: MetaImage, NIfTI, NRRD, TIFF, HDF5, Zarr or a folder of DICOM.
+        Volumes before and after the deformation: MetaImage, NIfTI, NRRD, TIFF, HDF5, Zarr or a folder of DICOM. A deformed scan on another
+        grid is resampled to that of the reference, and a warning says so.
     method : str
         ``"default"`` for digital volume correlation, or a classic method (see `naibu.imaging.measure_displacement`).
     mask : path-like, optional
@@ -269,9 +280,15 @@ def sense_pair(
     """
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     began = time.perf_counter()
-    measured = measure_displacement(
-        pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
-    )
+    try:
+        measured = measure_displacement(
+            pair.reference, pair.deformed, method=method, mask=pair.mask, deformed_mask=pair.deformed_mask, progress=progress
+        )
+    except InputError as error:  # that they were brought onto one grid may be why
+        if not pair.notes:
+            raise
+        raise InputError(". ".join([str(error), *pair.notes])) from error
+    measured = replace(measured, warnings=(*pair.notes, *measured.warnings))
     return recorded(pair, measured, time.perf_counter() - began, folder)
 
 
