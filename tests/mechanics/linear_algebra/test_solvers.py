@@ -213,7 +213,6 @@ def test_pardiso_may_factorize_with_fewer_threads_than_before():
 
 
 @needs_pardiso
-@needs_pardiso
 @pytest.mark.parametrize("symmetric", [True, False])
 def test_solutions_on_two_threads_do_not_depend_on_which_ends_first(symmetric):
     block, constrained = body(11)
@@ -230,6 +229,7 @@ def test_solutions_on_two_threads_do_not_depend_on_which_ends_first(symmetric):
         direct.use_threads(0)
 
 
+@needs_pardiso
 def test_recycled_cholesky_serves_other_tangents_and_many_columns():
     made = []
 
