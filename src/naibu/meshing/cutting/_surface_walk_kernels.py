@@ -126,14 +126,37 @@ def _fits(s, k, r, c, t, u, size, least, back):  # type: ignore[no-untyped-def] 
         return -1.0
     if k.whole[FREE]:
         return reached
-    if gap > 0.5 * distance:
+    if gap > 0.5 * distance or _strays(s, k, r, c, gap, low, high, one, two):
         return -1.0
-    x, y, z = from_to(p, r, c)
-    for i in range(1, 4):
-        qx, qy, qz = p[r, 0] + 0.25 * i * x, p[r, 1] + 0.25 * i * y, p[r, 2] + 0.25 * i * z
-        if on_side_of_path(k.points, k.length, k.normals, k.folds, m, qx, qy, qz, low, high, one, two)[0] > 0.5 * distance:
-            return -1.0
     return at if back else reached
+
+
+@njit(cache=True, **UNCOUNTED)
+def _strays(s, k, r, c, gap, low, high, one, two):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Whether the way from r to c, which is `gap` from the path, leads too far from it in between.
+
+    It is looked at in quarters, and in the middle of those between whose ends it may lead too far: no distance changes by more than the way.
+    """
+    p, m, most = s.position, k.whole[COUNT], 0.5 * k.real[DISTANCE]
+    x, y, z = from_to(p, r, c)
+    quarter, before, there = 0.25 * np.sqrt(dot(x, y, z, x, y, z)), most, most
+    for i in range(1, 5):
+        for middle in range(2):
+            f = 0.25 * i - 0.125 * middle
+            qx, qy, qz = p[r, 0] + f * x, p[r, 1] + f * y, p[r, 2] + f * z
+            if middle:
+                if before + there + quarter <= 2.0 * most:
+                    continue
+                if on_side_of_path(k.points, k.length, k.normals, k.folds, m, qx, qy, qz, low, high, one, two)[0] > most:
+                    return True
+            elif i == 4:
+                there = gap
+            else:
+                there = on_side_of_path(k.points, k.length, k.normals, k.folds, m, qx, qy, qz, low, high, one, two)[0]
+                if there > most:
+                    return True
+        before = there
+    return False
 
 
 @njit(cache=True, **UNCOUNTED)
