@@ -55,7 +55,7 @@ from naibu.identification.from_fields.regions.border_refinement import (
     refined_regions,
     without_errors_of_cells,
 )
-from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, segment, weight_of_borders
+from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, fitted_nearby, segment, weight_of_borders
 from naibu.identification.from_fields.uncertainty import resolution, resolution_report
 from naibu.identification.from_fields.verdict_within_cells import told_alike
 from naibu.identification.load_case import require_load_cases
@@ -65,7 +65,6 @@ START_POISSON_RATIO = 0.4
 NO_REGIONS = "No few regions of one material each explain the measurement: the result is a map under a penalty, without intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
-FAR = 0.5  # of a logarithm: whole cells may make an empty region of a soft one, about which derivatives say nothing of the one with borders
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
 
 
@@ -282,6 +281,8 @@ class _Recipe:
         """Return the regions as the result if they explain the measurements, else the field under the penalty."""
         target = self.model.n_free
         limit = max(field.chi_squared, target) + UNEXPLAINED * float(np.sqrt(2.0 * target))
+        if regions.point.misfit > limit:
+            regions = replace(regions, point=self._fitted(regions))
         misfit, count = regions.point.misfit, regions.zones.count
         self.record(
             f"{regions.clusters} clusters made {count} regions ({regions.moved} zones changed sides): misfit {misfit:.4g} without penalty"
@@ -303,16 +304,16 @@ class _Recipe:
         """Return the fit of regions whose borders run through cells, where there are few regions in a map of single cells."""
         single = graph.count == int((self.model.zones.of_cell != KNOWN).sum()) and self.model.mesh.dimension == 3
         if not single or not 1 < regions.zones.count <= MOST_REGIONS:
-            return self._sharp(regions.zones, regions.point, None)
+            return self._sharp(regions.zones, self._fitted(regions), None)
         try:
             refined = refined_regions(self.model, regions, graph, self.bounds)
         except ConvergenceError:
             self.record("no equilibrium was found with borders within cells: those on faces of cells are kept")
-            return self._sharp(regions.zones, regions.point, None)
+            return self._sharp(regions.zones, self._fitted(regions), None)
         charge = float(np.log(self.model.n_free) + np.log(graph.count)) * (regions.zones.count - refined.zones.count)
         if not 0.5 * refined.point.misfit < 0.5 * regions.point.misfit + charge:
             self.record("borders within cells explain no more than those on faces of cells, which are kept")
-            return self._sharp(regions.zones, regions.point, None)
+            return self._sharp(regions.zones, self._fitted(regions), None)
         self.record(f"borders of {refined.zones.count} regions within cells: misfit {refined.point.misfit:.4g}")
         corrected = self._corrected(refined)
         fewer = None if corrected is None else without_errors_of_cells(self.model, regions, graph, corrected, self.bounds)
@@ -321,13 +322,16 @@ class _Recipe:
             return self._with_borders(fewer, graph)
         refined = refined if corrected is None else corrected.refined
         model = self.model.with_zones(refined.zones)
-        start = model.evaluate(refined.theta, refined.point.states)
-        fitted = search(model, start, Objective(bounds=self.bounds), progress=self.progress).point
-        if np.abs(fitted.theta - refined.theta).max() > FAR:
-            fitted = model.evaluate(refined.theta, start.states)
+        fitted = fitted_nearby(model, model.evaluate(refined.theta, refined.point.states), self.bounds, self.progress)
         if corrected is not None:
             return self._estimate(model, model.evaluate(fitted.theta, fitted.states), Status.CONVERGED, refined, corrected)
         return self._sharp(refined.zones, fitted, refined)
+
+    def _fitted(self, regions: Segmentation) -> Point:
+        """Return the fit of regions of whole cells to the measurements alone, however far from where they were found."""
+        model = self.model.with_zones(regions.zones)
+        start = model.evaluate(regions.point.theta, regions.point.states)
+        return search(model, start, Objective(bounds=self.bounds), progress=self.progress).point
 
     def _corrected(self, refined: RefinedRegions) -> CorrectedRegions | None:
         """Return regions with borders as cells of half the size fit them; None where there are none, or they find no equilibrium."""

@@ -120,12 +120,19 @@ class SearchSettings:
     settled, nearly : float
         It also ends when moduli would move by fewer standard deviations than `settled`, and the objective would fall by a smaller part than
         `nearly`: surfaces of nearly incompressible bodies go on to move by what no modulus follows.
+    furthest : float
+        And where a logarithm of a modulus is further than this from its start, if nobody wants to know how much further it went.
     """
 
     max_iterations: int = 30
     tolerance: float = 1e-7
     settled: float = 0.02
     nearly: float = 1e-3
+    furthest: float = np.inf
+
+    def left(self, start: Point, point: Point) -> bool:
+        """Whether a point is too far from the start."""
+        return bool(np.abs(point.theta - start.theta).max() > self.furthest)
 
     def ended(self, step: Step, value: float) -> bool:
         """Whether a step promises too little, at a value of the objective."""
@@ -260,6 +267,8 @@ def search(
         if found is None:
             return Found(model.evaluate(point.theta, point.states), value, Status.CONVERGED, iteration, near)
         point, value = found
+        if chosen.left(start, point):
+            return Found(point, value, Status.ITERATION_LIMIT, iteration + 1, near)
     return Found(point, value, Status.ITERATION_LIMIT, chosen.max_iterations, near)
 
 

@@ -35,6 +35,7 @@ LIKE = 0.005  # difference of logarithms of moduli between neighbours that belon
 FACE = 0.55
 ROUNDS, PAIRS = 12, 3  # of merging and fitting; pairs that are tried where the fit does not confirm a merger
 ROUGHLY = SearchSettings(max_iterations=12, tolerance=1e-5)  # while the regions may still change
+FAR = 0.5  # of a logarithm: whole cells may make an empty region of a soft one, about which derivatives say nothing of the one with borders
 EXPLICIT = 500  # zones up to which a map is searched with the whole Hessian, and that may change sides between regions
 
 
@@ -49,7 +50,7 @@ class Segmentation:
     zones : Zones
         The regions as zones of the mesh.
     point : Point
-        The fit of their moduli to the measurements alone.
+        The fit of their moduli: to the measurements alone, or with the prior of contrasts where the former is far from it.
     clusters : int
         Number of clusters at the beginning.
     moved : int
@@ -249,8 +250,17 @@ def segment(
     zones = joined(model.zones, labels)
     regions = model.with_zones(zones)
     point = _at(regions, point.theta.reshape(2, -1)[:, order].ravel(), point)
-    point = search(regions, point, Objective(bounds=bounds), progress=progress).point
-    return Segmentation(labels, zones, point, max(CLUSTERS), moved)
+    return Segmentation(labels, zones, fitted_nearby(regions, point, bounds, progress), max(CLUSTERS), moved)
+
+
+def fitted_nearby(regions: FieldModel, point: Point, bounds: Bounds, progress: Progress | None = None) -> Point:
+    """Return the fit of regions to the measurements alone, or the given one where that is far from it, of which it knows little.
+
+    A region of whole cells that is a little too small or too large fits best nearly empty, or rigid; the way there is long, and ends where
+    the data say nothing any more.
+    """
+    found = search(regions, point, Objective(bounds=bounds), SearchSettings(furthest=FAR), progress=progress).point
+    return regions.evaluate(point.theta, point.states) if np.abs(found.theta - point.theta).max() > FAR else found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
