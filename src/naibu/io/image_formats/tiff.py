@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from naibu.core.arrays import AnyArray
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
@@ -155,8 +155,7 @@ def stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
         axes = np.asarray(shaped.get("direction", np.eye(3)), dtype=float) * np.asarray(shaped["spacing_mm"], dtype=float)
         return {"steps": axes, "origin": shaped.get("origin_mm", (0.0, 0.0, 0.0)), "spacing": shaped["spacing_mm"]}
     if file.is_ome and (sizes := _ome_sizes(source, file.ome_metadata or "")):
-        step = [sizes.get(axis, np.nan) for axis in "XYZ"]
-        return {"steps": np.where(np.eye(3, dtype=bool), np.diag(step), 0.0), "origin": (0.0, 0.0, 0.0), "spacing": step}
+        return _along_axes(np.array([sizes.get(axis, np.nan) for axis in "XYZ"]))
     imagej = file.imagej_metadata or {}
     named = str(imagej.get("unit", "")).replace("\\u00B5", "u")
     resolution_unit = {2: "inch", 3: "cm"}.get(int(getattr(page, "resolutionunit", 1) or 1))
@@ -168,8 +167,11 @@ def stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
             step[axis] = plane * denominator / numerator if numerator else np.nan
     if "spacing" in imagej:
         step[2] = plane * float(imagej["spacing"])
-    steps = np.diag(step)
-    return {"steps": np.where(np.eye(3, dtype=bool), steps, 0.0), "origin": (0.0, 0.0, 0.0), "spacing": step.tolist()}
+    return _along_axes(step)
+
+
+def _along_axes(step: FloatArray) -> dict[str, Any]:
+    return {"steps": np.where(np.eye(3, dtype=bool), np.diag(step), 0.0), "origin": (0.0, 0.0, 0.0), "spacing": step.tolist()}
 
 
 def _ome_sizes(source: str, xml: str) -> dict[str, float]:
