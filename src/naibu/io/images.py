@@ -21,7 +21,7 @@ from naibu.core.volume import Volume
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.reading import guarded_reading
 from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, ome_zarr, png, tiff, tiff_stack, zarr_store
-from naibu.io.image_formats.geometry import ReadOptions
+from naibu.io.image_formats.geometry import ReadOptions, raw_values
 
 _Handler = TypeVar("_Handler")
 VOLUME_READERS: dict[str, Callable[[Path, ReadOptions], Volume]] = {
@@ -55,6 +55,7 @@ _BOX_READERS: dict[str, Callable[[Path, ArrayLike, ArrayLike, ReadOptions], Volu
 }
 _STORES = (".zarr", ome_zarr.ENDING)  # folders that are one volume
 _VECTOR_WRITERS = {".mha": metaimage.write, ".mhd": metaimage.write, ".nrrd": nrrd.write, ome_zarr.ENDING: ome_zarr.write}
+_RAW = (".raw", ".bin", ".vol")
 _HDF5 = (".h5", ".hdf5")
 _OPENERS: dict[str, Callable[[Path], ChunkedVolume]] = {
     ".zarr": zarr_store.open_chunked,
@@ -260,7 +261,11 @@ def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:
     """Return the reader of a file or folder."""
     if source.is_dir() and _ending(source) not in _STORES:
         return dicom.read if _is_dicom(source) else tiff.read
-    return dicom.read if _is_dicom(source) else _of(VOLUME_READERS, source, "read")
+    if _is_dicom(source):
+        return dicom.read
+    if source.suffix.lower() in _RAW:
+        raise raw_values(source)
+    return _of(VOLUME_READERS, source, "read")
 
 
 def _ending(path: Path) -> str:

@@ -35,6 +35,6 @@ def test_a_file_that_leaves_it_open_is_refused(tmp_path: Path) -> None:
     for read in (read_volume, open_volume):
         with pytest.raises(InputError, match="give it as spacing_mm"):
             read(path)
-    for datasets in ({"data": VALUES, "dark": VALUES}, {"data": VALUES[0]}):
-        with pytest.raises(InputError, match="contains no volume"):
+    for datasets, expected in (({"data": VALUES, "dark": VALUES}, "several volumes"), ({"data": VALUES[0]}, "contains no volume")):
+        with pytest.raises(InputError, match=expected):
             open_volume(written(path, **datasets), spacing_mm=(1.0, 1.0, 1.0))

@@ -11,7 +11,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.workflows.fields.block_mesh import block_mesh
-from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, measured_load_case
+from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, measured_load_case, placed_on_scan
 
 SIDE_MM = 40.0
 INSIDE = Volume.from_array(np.ones((20, 20, 20), np.uint8), spacing_mm=(2.0,) * 3, origin_mm=(1.0,) * 3)
@@ -45,6 +45,31 @@ def test_points_at_a_place_and_lengths_in_metres_are_refused(points: FloatArray)
 def test_where_field_and_object_are_is_told() -> None:
     with pytest.raises(InputError, match=r"0 measurements.*20 are needed.*x 1007 to 3.881e\+04.*x 0 to 40.*one reference scan"):
         case(1000.0 * POINTS)
+
+
+@pytest.mark.parametrize(
+    ("points", "expected"),
+    [
+        (1000.0 * POINTS, r"100 % of the points would lie in it if they were in um; give `unit` um\."),
+        (POINTS * [-1.0, -1.0, 1.0], "in RAS; change the signs of x, y, ux and uy"),
+        (POINTS + 500.0, r"reference scan\?$"),
+    ],
+)
+def test_the_unit_or_frame_in_which_a_field_would_lie_in_the_object_is_named(points: FloatArray, expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
+        case(points)
+
+
+def test_voxels_are_counted_in_the_scan_that_labels_lie_on() -> None:
+    axes = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # voxels along x go to posterior, along y to the right
+    scan = Volume.from_array(INSIDE.values, spacing_mm=(2.0, 3.0, 4.0), origin_mm=(-100.0, 50.0, -300.0), direction=axes)
+    size = np.array([2.0, 3.0, 4.0])
+    field = DisplacementField.from_arrays([[5.0, 6.0, 7.0]] * size, [[1.0, 0.0, 0.5]] * size, sd_mm=[[0.1, 0.2, 0.3]])
+    placed = placed_on_scan(field, size.tolist(), scan)
+    np.testing.assert_allclose(placed.points, [[-118.0, 60.0, -272.0]])
+    np.testing.assert_allclose(placed.vectors, [[0.0, 2.0, 2.0]])
+    np.testing.assert_allclose(placed.standard_deviation, [[0.2, 0.1, 0.3]])
+    assert placed_on_scan(field, (2.0, 3.0, 3.9), scan) is field  # labels on other voxels say nothing of those of the field
 
 
 def test_a_field_without_displacements_is_refused_as_such() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -147,3 +148,12 @@ def no_colours(source: str, samples: int, what: str = "colour samples per voxel"
     """
     if samples != 1:
         raise InputError(f"{source}: has {samples} {what} (RGB or vectors), not one intensity; convert it to greyscale first")
+
+
+def raw_values(path: Path) -> InputError:
+    """Return the error of a file of values without a header, which says what header to write."""
+    return InputError(
+        f"{path.name}: holds values without a header; write a text file {path.stem}.mhd beside it with the lines NDims = 3, "
+        "DimSize = nx ny nz, ElementSpacing = dx dy dz (mm), ElementType = MET_SHORT (or MET_USHORT, MET_UCHAR, MET_FLOAT), "
+        f"ElementByteOrderMSB = False, ElementDataFile = {path.name}, and read that"
+    )

@@ -1,7 +1,8 @@
 """Image volumes in HDF5, chunked, so that parts of a volume larger than memory can be read.
 
 The file contains a dataset ``values`` (nz, ny, nx) with the attributes ``spacing_mm``, ``origin_mm`` (x, y, z) and ``direction`` (3, 3).
-Where the spacing of voxels is given, the only dataset with three axes of numbers of another program's file is read, too.
+The only dataset with three axes of numbers of another program's file is read, too, where the spacing of voxels is given, or stands in its
+attribute ``element_size_um`` (z, y, x, in micrometres), as Fiji and ilastik write it.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from naibu.io.files.reading import require_plausible, require_regular
 from naibu.io.image_formats.geometry import ReadOptions, volume_with_axes
 
 BLOCK = 64
+_ELEMENT_SIZE = "element_size_um"
 _ATTRIBUTES = ("spacing_mm", "origin_mm", "direction")
 
 
@@ -121,10 +123,14 @@ def _foreign(path: Path, file: h5py.File, spacing_mm: FloatArray | None) -> h5py
     found: list[h5py.Dataset] = []
     file.visititems(lambda _, item: found.append(item) if isinstance(item, h5py.Dataset) and _is_volume(item) else None)
     names = ", ".join(repr(item.name) for item in found) or str(sorted(file))
-    if len(found) != 1:
-        expected = f"a dataset 'values' with the attributes {', '.join(f'`{name}`' for name in _ATTRIBUTES)}, or one with three axes"
+    if len(found) > 1:
+        raise InputError(
+            f"{path.name}: holds several volumes ({names}), and does not tell which is the scan; save one as a file of its own"
+        )
+    if not found:
+        expected = "one dataset of numbers with three axes (z, y, x)"
         raise InputError(f"{path.name}: contains no volume: naibu expects {expected}; the file has {names}")
-    if spacing_mm is None:
+    if spacing_mm is None and _ELEMENT_SIZE not in found[0].attrs:
         raise InputError(f"{path.name}: does not state the distance of the voxels of {names}; give it as spacing_mm")
     return found[0]
 
@@ -137,6 +143,8 @@ def _frame(stored: Any, spacing_mm: FloatArray | None) -> dict[str, FloatArray]:
     """Return spacing and position of the voxels, as the file states them or as they were given."""
     if all(name in stored.attrs for name in _ATTRIBUTES):
         return {name: np.asarray(stored.attrs[name], dtype=float) for name in _ATTRIBUTES}
+    if spacing_mm is None:
+        spacing_mm = np.asarray(stored.attrs[_ELEMENT_SIZE], dtype=float)[::-1] / 1000.0
     return {"spacing_mm": np.asarray(spacing_mm, dtype=float), "origin_mm": np.zeros(3), "direction": np.eye(3)}
 
 

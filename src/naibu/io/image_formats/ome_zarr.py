@@ -97,18 +97,32 @@ def open_levels(path: Path, options: ReadOptions | None = None) -> ChunkedVolume
             f"{path.name}: is no OME-Zarr image ({type(error).__name__}: {error}); write it with naibu.io.write_volume"
         ) from error
     names = "".join(str(axis.get("name", "?")) for axis in axes)
-    if names != "zyx" or stored.ndim != 3:
-        raise InputError(f"{path.name}: has the axes {names}, not zyx; save one time point and channel")
-    unit = _unit(path, axes, options)
+    if names[-3:] != "zyx" or stored.ndim != len(names) or any(n != 1 for n in stored.shape[:-3]):
+        size = " x ".join(str(n) for n in stored.shape)
+        raise InputError(f"{path.name}: has the axes {names} of {size}, not zyx; save one time point and channel")
+    unit = _unit(path, axes[-3:], options)
     scale, shift = np.ones(3), np.zeros(3)
     for step in steps:
         if step.get("type") == "scale":
-            scale, shift = scale * step["scale"], shift * step["scale"]
+            scale, shift = scale * step["scale"][-3:], shift * step["scale"][-3:]
         elif step.get("type") == "translation":
-            shift = shift + step["translation"]
+            shift = shift + step["translation"][-3:]
     direction = np.asarray(kept.get("direction", np.eye(3)), dtype=float)
     origin = np.asarray(kept["origin_mm"], dtype=float) if "origin_mm" in kept else unit * shift[::-1]
-    return ChunkedVolume.from_array(stored, spacing_mm=unit * scale[::-1], origin_mm=origin, direction=direction)
+    values = stored if stored.ndim == 3 else _OneVolume(stored)
+    return ChunkedVolume.from_array(values, spacing_mm=unit * scale[::-1], origin_mm=origin, direction=direction)
+
+
+class _OneVolume:
+    """The only time point and channel of an array (t, c, z, y, x), of which only what is sliced is read."""
+
+    def __init__(self, stored: Any) -> None:
+        self._stored, self._first = stored, (0,) * (stored.ndim - 3)
+        self.shape, self.dtype = tuple(stored.shape[-3:]), stored.dtype
+
+    def __getitem__(self, box: Any) -> AnyArray:
+        """Return a part; indices are along z, y, x."""
+        return np.asarray(self._stored[(*self._first, *(box if isinstance(box, tuple) else (box,)))])
 
 
 def read(path: Path, options: ReadOptions) -> Volume:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import io
 import re
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from naibu.core.arrays import AnyArray
+from naibu.core.arrays import AnyArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
@@ -18,6 +19,7 @@ from naibu.io.files.reading import require_regular
 from naibu.io.image_formats.geometry import MM_PER_UNIT, ReadOptions, no_colours, three_axes, unit_length, volume_with_axes
 
 _ENDINGS = (".tif", ".tiff")
+_PIXELS, _ATTRIBUTE = re.compile(r"<(?:\w+:)?Pixels\b([^>]*)>"), re.compile(r"(\w+)\s*=\s*[\"']([^\"']*)[\"']")
 _NUMBER = re.compile(r"(\d+)(?!.*\d)")
 
 
@@ -152,6 +154,8 @@ def stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
     if "spacing_mm" in shaped:
         axes = np.asarray(shaped.get("direction", np.eye(3)), dtype=float) * np.asarray(shaped["spacing_mm"], dtype=float)
         return {"steps": axes, "origin": shaped.get("origin_mm", (0.0, 0.0, 0.0)), "spacing": shaped["spacing_mm"]}
+    if file.is_ome and (sizes := _ome_sizes(source, file.ome_metadata or "")):
+        return _along_axes(np.array([sizes.get(axis, np.nan) for axis in "XYZ"]))
     imagej = file.imagej_metadata or {}
     named = str(imagej.get("unit", "")).replace("\\u00B5", "u")
     resolution_unit = {2: "inch", 3: "cm"}.get(int(getattr(page, "resolutionunit", 1) or 1))
@@ -163,5 +167,21 @@ def stated_geometry(source: str, file: Any, page: Any) -> dict[str, Any]:
             step[axis] = plane * denominator / numerator if numerator else np.nan
     if "spacing" in imagej:
         step[2] = plane * float(imagej["spacing"])
-    steps = np.diag(step)
-    return {"steps": np.where(np.eye(3, dtype=bool), steps, 0.0), "origin": (0.0, 0.0, 0.0), "spacing": step.tolist()}
+    return _along_axes(step)
+
+
+def _along_axes(step: FloatArray) -> dict[str, Any]:
+    return {"steps": np.where(np.eye(3, dtype=bool), np.diag(step), 0.0), "origin": (0.0, 0.0, 0.0), "spacing": step.tolist()}
+
+
+def _ome_sizes(source: str, xml: str) -> dict[str, float]:
+    """Return the size of a voxel along the axes (X, Y, Z) for which the OME metadata of the first image state one, mm."""
+    pixels = _PIXELS.search(xml)
+    stated = {name: html.unescape(value) for name, value in _ATTRIBUTE.findall(pixels.group(1))} if pixels else {}
+    sizes = {}
+    for axis in "XYZ":
+        size = stated.get(f"PhysicalSize{axis}")
+        unit = stated.get(f"PhysicalSize{axis}Unit", "µm")  # that of the schema
+        if size is not None and unit not in ("pixel", "reference frame"):
+            sizes[axis] = float(size) * unit_length(source, unit)
+    return sizes

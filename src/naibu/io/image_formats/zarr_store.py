@@ -22,6 +22,7 @@ from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.replaced_folder import replaced_folder
+from naibu.io.image_formats import ome_zarr
 from naibu.io.image_formats.geometry import ReadOptions, volume_with_axes
 
 CHUNK = 64
@@ -66,6 +67,8 @@ def open_chunked(path: Path, options: ReadOptions | None = None) -> ChunkedVolum
         raise InputError(f"{path}: there is no such Zarr store; a Zarr volume is a folder")
     try:
         group = zarr.open_group(str(path), mode="r")
+        if "values" not in group and "multiscales" in group.attrs.get("ome", group.attrs):
+            return ome_zarr.open_levels(path, options)  # whatever it is called
         stored = group["values"]
     except (KeyError, ValueError, OSError) as error:
         raise InputError(f"{path.name}: contains no volume: naibu expects a Zarr group with an array 'values' ({error})") from error

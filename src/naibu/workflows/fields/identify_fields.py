@@ -47,7 +47,7 @@ from naibu.workflows.fields.block_mesh import (
     sizes_of_voxels,
 )
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
-from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, relative_deformation
+from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, placed_on_scan, relative_deformation
 from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ObjectOnCubes, ScannedObject, identified_on_smaller_cubes
 from naibu.workflows.fields.thin_coverings import Covering, told_left_out
 from naibu.workflows.results.files_together import written_together
@@ -199,6 +199,7 @@ def identify_fields(
     read = [read_field(path, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing) for path in paths]
     _require_different(paths, read)
     inside, labels = labelled_object(mask, zones)
+    read = [placed_on_scan(field, spacing_mm, inside) for field in read]
     names = names_of_labels(labels, inside, zone_names or {})
     stated = _stated(known, list(names.values()), each_cell=each_cell)
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
@@ -231,11 +232,10 @@ def identify_fields(
         load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
         region_at=cubes.region_at,
     )  # fmt: skip
-    doubts, coarse = _told(found, cubes)
+    doubts, coarse = told = _told(found, cubes)
     notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
     own = () if scanned.covering is None else tuple(name for name in scanned.covering.names if name not in given.values)
-    told = (*doubts, *coarse)
-    result = FieldIdentification(found, body, stated.relative, notes, told, inside, cubes.cell_of_voxel, scanned.covering, own)
+    result = FieldIdentification(found, body, stated.relative, notes, sum(told, ()), inside, cubes.cell_of_voxel, scanned.covering, own)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 

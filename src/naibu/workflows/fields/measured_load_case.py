@@ -14,6 +14,7 @@ from naibu.core.rigid_transform import registration
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.identified.sides import loaded_nodes
+from naibu.io.tables.table_cells import MM_PER_UNIT
 from naibu.meshing.point_location import locate
 
 FEWEST_POINTS = 20
@@ -21,6 +22,7 @@ THINNEST = 0.1  # of a cell: points that span less along a direction do not tell
 MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
 LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
 MOST_BEYOND = 0.2  # of the points outside of the object: more than its rim
+LIKELY = 0.5  # of the points in the object, and of its extent: from here on another unit or frame is named as likely
 ZERO = 5, 0.01  # points, and part of them, with a displacement of exactly zero: no measurement is that by chance
 TINY_DEFORMATION = 1e-4  # so little is usual for waves and interferometry, and for scans and particles is a sign of another unit
 
@@ -65,6 +67,7 @@ def measured_load_case(
         raise InputError(
             f"{name}: {len(chosen)} measurements of the field lie in the object, {FEWEST_POINTS} are needed; it spans "
             f"{_spans(at.points[at.valid])} mm, the object {_spans(mesh.points)} mm: are both in mm, and from one reference scan?"
+            f"{_likely_frame(at.points[at.valid], inside)}"
         )
     _require_space(name, mesh, at.points[chosen])
     # copies of a measurement, such as those of nodes that cells of a mesh do not share, count once
@@ -75,6 +78,40 @@ def measured_load_case(
     some = DisplacementField.from_arrays(at.points[chosen], at.vectors[chosen], covariance=covariance)
     _require_deformation(name, some)
     return FieldLoadCase.of(name, some, mesh, loaded=loaded_nodes(mesh, inside.direction, sides))
+
+
+def placed_on_scan(field: DisplacementField, spacing_mm: Sequence[float] | None, scan: Volume) -> DisplacementField:
+    """Return a field whose positions are voxels times their size, counted from voxel 0, in the frame of the scan that they count.
+
+    Parameters
+    ----------
+    field : DisplacementField
+        At points of three coordinates.
+    spacing_mm : sequence of float or None
+        Size of a voxel along x, y, z, mm, as it was given for the field; None for one in mm, which is returned as it is.
+    scan : Volume
+        Mask or labels; of voxels of another size, they are not the voxels of the field, which is returned as it is.
+    """
+    if spacing_mm is None or field.points.shape[1] != 3 or not np.allclose(scan.spacing_mm, spacing_mm, rtol=1e-3):
+        return field
+    points, turn = scan.to_physical(field.points / np.asarray(spacing_mm)), scan.direction
+    covariance = None if field.covariance is None else turn @ field.covariance @ turn.T
+    return DisplacementField.from_arrays(points, field.vectors @ turn.T, covariance=covariance, valid=field.valid)
+
+
+def _likely_frame(points: FloatArray, inside: Volume) -> str:
+    """Return in words in which unit or frame most points would lie in the object, if in one of those that are common; else nothing."""
+    tried = {f"in {unit}; give `unit` {unit}": MM_PER_UNIT[unit] * points for unit in ("cm", "m", "um", "inch")}
+    tried["in RAS; change the signs of x, y, ux and uy"] = points * [-1.0, -1.0, 1.0]
+    tried["in voxels; give spacing_mm"] = inside.to_physical(points)
+    for told, moved in tried.items():
+        index = np.round(inside.to_index(moved)).astype(int)[:, ::-1]
+        there = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
+        there[there] = inside.values[tuple(index[there].T)] != 0
+        extents = np.ptp(moved, axis=0).max(), np.ptp(inside.to_physical(np.argwhere(inside.values)[:, ::-1]), axis=0).max()
+        if there.mean() > LIKELY and extents[0] > LIKELY * extents[1]:
+            return f" {100.0 * there.mean():.0f} % of the points would lie in it if they were {told}."
+    return ""
 
 
 def _spans(points: FloatArray) -> str:
