@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual
-from naibu.identification.lattice_calibration.intervals.residual_model import RISE, ResidualModel
+from naibu.identification.lattice_calibration.intervals.residual_model import BOX, RISE, ResidualModel
 from naibu.identification.lattice_calibration.intervals.widened_covariance import FARTHEST, widened_covariance
 
 WEAK_PRIOR = 100.0
@@ -85,6 +85,25 @@ def test_a_better_fit_beyond_the_end_of_an_interval_is_told() -> None:
     widened = widened_covariance(law, point, zero, WEAK_PRIOR, law)  # type: ignore[arg-type]
     assert widened.lower > 80.0
     assert any("there is a better fit" in remark for remark in widened.remarks(tuple("abcde")))
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_the_way_to_an_end_stops_where_no_logarithm_may_change_any_more(side: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From a minimum next to that place, chi-squared flat, the way was walked for ever."""
+    slopes = np.array([[1e-3, 0.0], [0.0, 1.0]])
+    point = EvaluatedPoint(np.zeros(2), (np.zeros(2), np.zeros(0)), (slopes, np.zeros((0, 2))))
+    model = ResidualModel(point, np.eye(2), np.zeros(2), 100.0, np.zeros((2, 3)))
+    left, coefficients = [500], ResidualModel.coefficients
+
+    def counted(self: ResidualModel, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        left[0] -= 1
+        assert left[0], "no end"
+        return coefficients(self, theta)
+
+    monkeypatch.setattr(ResidualModel, "coefficients", counted)
+    minimum = np.array([side * 0.98 * BOX, 0.0])
+    end = model.cost().end(minimum, 0.0, 0, side * 2.0, FARTHEST)
+    np.testing.assert_allclose(end, [side * 0.99 * BOX, 0.0], atol=1e-6)
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])

@@ -130,11 +130,12 @@ class ModelledCost:
         reach : float
             Where that is by derivatives: change of its logarithm, with the sign of the side.
         farthest : float
-            Change at which it ends even where chi-squared has risen by less.
+            Change at which it ends even where chi-squared has risen by less, or earlier where no logarithm may change any more.
         """
         free, side = np.delete(np.arange(len(theta), dtype=np.int64), k), float(np.sign(reach))
         here, low, step = theta, lowest, 0.25 * abs(reach)
-        while (left := farthest - abs(here[k] - theta[k])) > 1e-9:
+        last = self._held(theta + side * farthest * np.eye(len(theta))[k])[k]
+        while (left := side * (last - here[k])) > 1e-9:
             tangent = np.linalg.solve(self(here)[2], np.eye(len(theta))[k])
             ahead = side * min(step, left) / tangent[k] * tangent
             there, high = self.fitted(self._held(here + ahead), free)
