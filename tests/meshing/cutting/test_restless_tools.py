@@ -13,7 +13,7 @@ from scipy.spatial import Delaunay
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.meshing import SurfaceCut, SurfaceCutter, boundary_faces, box, groove
 
-SIZE, PIXEL = 100.0, 0.2  # mm
+SIZE, PIXEL, RIM = 100.0, 0.2, 10.0  # mm
 Surface = tuple[FloatArray, IntArray]
 
 
@@ -73,25 +73,25 @@ def require_whole(cut: SurfaceCut, area: float, distance: float, refined: bool) 
         assert np.isfinite(walls.points).all() and walls.area_mm2 > 0.0
 
 
-def gaps_from(cut: SurfaceCut) -> FloatArray:
-    """Return the distance of every pixel of the square from the paths of the tool over it, mm."""
-    n = round(SIZE / PIXEL)
-    free = np.ones((n, n), dtype=bool)
+def gaps_from(cut: SurfaceCut, beside: bool) -> FloatArray:
+    """Return the distance of every pixel of the square from the paths of the tool over it, or `beside` it as well, mm."""
+    n, rim = round(SIZE / PIXEL), round(RIM / PIXEL)
+    free = np.ones((n + 2 * rim, n + 2 * rim), dtype=bool)
     for way, _, over in cut.paths:
-        for i in np.flatnonzero(over[1:] & over[:-1]):
+        for i in np.flatnonzero((over[1:] & over[:-1]) | beside):
             steps = max(2, int(np.linalg.norm(way[i + 1] - way[i]) / (0.4 * PIXEL)))
             places = way[i] + np.linspace(0.0, 1.0, steps)[:, None] * (way[i + 1] - way[i])
-            x, y = np.clip((places[:, :2] / PIXEL).astype(np.int64), 0, n - 1).T
+            x, y = np.clip((places[:, :2] / PIXEL + rim).astype(np.int64), 0, len(free) - 1).T
             free[x, y] = False
-    return np.asarray(distance_transform_edt(free) * PIXEL)
+    return np.asarray(distance_transform_edt(free)[rim:-rim, rim:-rim] * PIXEL)
 
 
 def require_pieces_of_the_plane(cut: SurfaceCut, distance: float) -> None:
     """What no path comes between is one piece; what paths enclose is a piece, unless it is told that the sides hang together."""
-    gap = gaps_from(cut)
-    x, y, _ = np.clip((cut.points[cut.triangles].mean(axis=1) / PIXEL).astype(np.int64), 0, len(gap) - 1).T
-    far = gap[x, y] > distance
-    beside, parted = (label(gap > wall)[0][x, y][far] for wall in (0.5 * distance + 2.0 * PIXEL, PIXEL))
+    over, all_paths = gaps_from(cut, False), gaps_from(cut, True)  # a tool that passes just beside the border may chip it
+    x, y, _ = np.clip((cut.points[cut.triangles].mean(axis=1) / PIXEL).astype(np.int64), 0, len(over) - 1).T
+    far = all_paths[x, y] > distance
+    beside, parted = (label(gap > wall)[0][x, y][far] for gap, wall in ((all_paths, 0.5 * distance + 2.0 * PIXEL), (over, PIXEL)))
     piece = cut.piece[far]
     assert all(len(np.unique(piece[beside == place])) == 1 for place in np.unique(beside))
     if not len(cut.bridges) and cut.missed_mm == 0.0:
