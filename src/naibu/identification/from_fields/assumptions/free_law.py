@@ -162,11 +162,11 @@ class _Search:
     def n_shapes(self) -> int:
         return len(self.cells) * N_SHAPES
 
-    def evaluated(self, theta: FloatArray, added: FloatArray, guesses: Sequence[FloatArray]) -> _Place:
-        """Find equilibrium with these moduli and shapes."""
+    def evaluated(self, theta: FloatArray, added: FloatArray, guesses: Sequence[FloatArray], near: _Place | None = None) -> _Place:
+        """Find equilibrium with these moduli and shapes; preconditioners of a place near by serve there as well."""
         shapes = added[: self.n_shapes].reshape(-1, N_SHAPES).T @ self.cells
         model = self.model.under(self.law.with_shapes(shapes))
-        model.boundary = self.model.boundary.copied()
+        model.boundary = (self if near is None else near).model.boundary.copied()
         point = model.evaluate(theta, guesses)
         residuals = [o.residual(u) for o, u in zip(model.observed, point.states, strict=True)]
         for t, error in enumerate(self.of_elements):
@@ -328,7 +328,7 @@ def _further(search: _Search, here: _Place, step: _Step, variance: float) -> _Pl
     for _ in range(HALVINGS):
         guesses = [u + part * m.reshape(u.shape) for u, m in zip(here.point.states, step.motion, strict=True)]
         try:
-            there = search.evaluated(here.point.theta + part * step.theta, here.added + part * step.added, guesses)
+            there = search.evaluated(here.point.theta + part * step.theta, here.added + part * step.added, guesses, here)
         except ConvergenceError:  # shapes that a body cannot follow
             part *= 0.5
             continue

@@ -25,7 +25,8 @@ BOUNDARY_TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-3  # relative residuals; the latt
 EXACT_TRACE, PROBES = 1200, 64  # components up to which a trace is computed as it is; random vectors that estimate it beyond
 BOUNDARY_ITERATIONS = 200
 REFRESHED = 400  # loaded components up to which their Hessian is made anew at every point
-WORTH = 2  # columns times iterations, over loaded components, with the Hessian of an earlier point, after which it is made anew
+WORTH = 1  # column iterations, over loaded components, with the Hessian of an earlier point, after which it is made anew
+AN_ITERATION = 8  # columns: what an iteration costs beside that of its columns, as factors pass through memory once for all of them
 AT_ONCE = 4  # iterations from which so many columns cost more with the Hessian of an earlier point than one made anew
 
 
@@ -133,7 +134,7 @@ class KeptPreconditioners:
     informed : list of float or None
         Number of loaded components that the measurements determine, from the last one made; None before a first one.
     spent : int
-        Columns times iterations that were solved with them at other points than that at which they were made.
+        Column iterations that were solved with them at other points than that at which they were made, `AN_ITERATION` for each besides.
     """
 
     made: list[BoundaryPreconditioner | None]

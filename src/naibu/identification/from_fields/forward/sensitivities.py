@@ -25,6 +25,7 @@ from naibu.identification.from_fields.forward.field_laws import FieldElements, F
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, loaded_from_rest
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones, is_surface_sought
 from naibu.identification.from_fields.forward.loaded_components import (
+    AN_ITERATION,
     AT_ONCE,
     BLOCK,
     BOUNDARY_TOLERANCE,
@@ -324,7 +325,7 @@ class Linearised:
         """Return about what the inverse of the Hessian of the loaded components makes of (n_b, r) of every load case."""
         made = [self.boundary(t) for t in range(len(loaded))]
         if not self._fresh:
-            self.model.boundary.spent += sum(b.shape[1] for b in loaded)
+            self.model.boundary.spent += sum(b.shape[1] + AN_ITERATION for b in loaded)
         groups: dict[int, list[int]] = {}
         for t, one in enumerate(made):
             groups.setdefault(id(one.factor), []).append(t)

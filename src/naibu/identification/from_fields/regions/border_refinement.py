@@ -293,10 +293,10 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     residuals, converged, before, least, of_law = tuple[FloatArray, ...](), False, here, np.inf, True
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
-        finer = changes_on_finer_mesh(at, law, now.moduli_on)
+        finer = changes_on_finer_mesh(at, law if of_law else "linear", now.moduli_on)  # no equilibrium once, none later
         if finer is None:
             return None
-        changes, of_law = finer[0], of_law and finer[1] == law
+        changes, of_law = finer[0], finer[1] == law
         left = sum(float(np.sum((o.residual(u) + c) ** 2)) for o, u, c in zip(model.observed, at.point.states, changes, strict=True))
         if left > least:  # surfaces that follow precise data move differently among smaller cells: no more can be said
             here = before
