@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import gc
 import os
 import pickle
 import shutil
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
@@ -19,11 +21,25 @@ THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 def pytest_configure() -> None:
     """Let linear algebra have one thread in each worker, and in what tests start, unless the user wants it otherwise.
 
-    Workers fill the cores: threads of small matrices would wait for one another by computing. Kernels have their threads all the same.
+    Workers fill the cores: threads of small matrices would wait for one another by computing. Kernels have their threads all the same;
+    these wait asleep.
     """
     if not any(variable in os.environ for variable in THREADS):
         os.environ.update(dict.fromkeys(THREADS, "1"))
         threadpool_limits(1, user_api="blas")  # what is loaded already
+    # each worker has as many of them as there are cores: they would spin on cores that others need
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Search for no cycles while tests are collected, and leave what was collected, half a million objects, out of later searches."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
 
 
 @pytest.fixture(scope="session")
