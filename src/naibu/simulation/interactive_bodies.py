@@ -156,9 +156,7 @@ class LatticeBody:
 
     def grip_velocity(self, velocity: FloatArray) -> FloatArray:
         """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
-        velocities = np.zeros((2, 3))
-        velocities[1] = velocity
-        return velocities
+        return np.array([(0.0, 0.0, 0.0), velocity])
 
     def step(
         self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float
@@ -351,9 +349,7 @@ class FiniteElementBody:
 
     def grip_velocity(self, velocity: FloatArray) -> FloatArray:
         """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
-        velocities = np.zeros((2, 3))
-        velocities[1] = velocity
-        return velocities
+        return np.array([(0.0, 0.0, 0.0), velocity])
 
     def step(
         self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float
