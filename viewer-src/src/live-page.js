@@ -40,6 +40,8 @@ const CURVE_MS = 50; // from one drawing of the curves to the next
 const UNBALANCED = 0.05; // of all forces, above which the badge says so
 const digits = (value) => String(Number(value.toPrecision(3))).replace("-", "−");
 const CONFLICTS = new Set(["cut", "tool", "grip", "undo", "reset"]); // with a cut under way: another body comes of it, or none
+const WAIT = "A cut is being computed: wait until it opens.";
+const ANEW = new Set([...CONFLICTS, "pause", "record", "replay"]); // what was wrong with an earlier command is no longer told then
 /** Gamepads that are connected; none where the page may not ask for them, as within a frame of another site. */
 const gamepads = () => {
   try {
@@ -166,8 +168,9 @@ class LivePage {
   /** Send a command; those that steer are not sent by a page that only watches. */
   command(type, values = {}, always = false) {
     if (!this.frame?.driving && !always) this.#say("Another page drives this simulation; this one watches.");
-    else if (this.notice.cutting && CONFLICTS.has(type)) this.#say("A cut is being computed: wait until it opens.");
+    else if (this.notice.cutting && CONFLICTS.has(type)) this.#say(WAIT);
     else {
+      if (ANEW.has(type)) this.#say("");
       this.link.send({ type, ...values });
       if (type === "cut") this.notice.ask();
     }
@@ -327,6 +330,7 @@ class LivePage {
     this.#badge(frame);
     this.notice.follow(frame, performance.now());
     this.notice.permit(frame, this.conflicting);
+    if (!this.notice.cutting && this.message.textContent === WAIT) this.#say("");
     this.#write(frame, performance.now());
     this.stage.setAttribute("data-ready", "1");
   }

@@ -156,7 +156,7 @@ class LatticeBody:
 
     def grip_velocity(self, velocity: FloatArray) -> FloatArray:
         """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
-        return np.array(((0.0, 0.0, 0.0), velocity))
+        return np.array([(0.0, 0.0, 0.0), velocity])
 
     def step(
         self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float
@@ -349,7 +349,7 @@ class FiniteElementBody:
 
     def grip_velocity(self, velocity: FloatArray) -> FloatArray:
         """Return the velocities of the support and of the gripped nodes (2, 3), mm/s."""
-        return np.array(((0.0, 0.0, 0.0), velocity))
+        return np.array([(0.0, 0.0, 0.0), velocity])
 
     def step(
         self, session: AnySession, velocity: FloatArray, motions: Sequence[IndenterMotion], steps: int, budget_s: float

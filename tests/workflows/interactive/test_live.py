@@ -352,6 +352,25 @@ def test_a_person_cuts_a_body_and_takes_it_back(tmp_path: Path, kind: str) -> No
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
+def test_what_was_wrong_is_told_until_it_is_over_or_something_else_is_begun() -> None:
+    said = "naibuLive.message.textContent"
+    with served() as (address, _), opened_browser() as page:
+        page.open(address)
+        page.wait("document.querySelector('.stage[data-ready]') !== null && naibuLive.frame.tool === 0", 60)
+        page.value("naibuLive.notice.ask(); naibuLive.command('undo')")  # as if a cut were under way
+        assert page.value(said) == "A cut is being computed: wait until it opens."
+        page.value("naibuLive.notice.forget()")
+        page.wait(f"{said} === ''", 30)
+        page.value("naibuLive.command('cut', {edges: [[[0, 0, 0], [0, 0, 0]], [[0, 0, 0], [0, 0, 0]]]})")
+        page.wait(f"{said}.startsWith('the blade sweeps no area')", 30)
+        page.value("naibuLive.command('move', {at: [20, 20, 60]})")
+        assert page.value(said).startswith("the blade sweeps no area")  # still to be read
+        page.value("naibuLive.command('pause', {on: true})")
+        assert page.value(said) == ""
+        assert page.console == []
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 def test_markers_are_seen_in_a_section_and_the_tool_that_waits_is_seen_whole(tmp_path: Path) -> None:
     body = touched_lattice()
     inner = np.flatnonzero((np.abs(body.points - body.points.mean(axis=0)) < 0.45 * np.ptp(body.points, axis=0)).all(axis=1))

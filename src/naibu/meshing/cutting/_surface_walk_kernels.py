@@ -135,7 +135,7 @@ def _fits(s, k, r, c, t, u, size, least, back):  # type: ignore[no-untyped-def] 
 def _strays(s, k, r, c, gap, low, high, one, two):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Whether the way from r to c, which is `gap` from the path, leads too far from it in between.
 
-    Looked at are the quarters, and the middle of those in which it may: no distance changes by more than the way.
+    It is looked at in quarters, and in the middle of those in which it may lead too far: a distance changes by no more than the way.
     """
     p, m, most = s.position, k.whole[COUNT], 0.5 * k.real[DISTANCE]
     x, y, z = from_to(p, r, c)
