@@ -258,8 +258,8 @@ def _check_directions(prepared: PreparedStudy, before: Compared) -> None:
         times = float(np.sqrt((ours**2).sum() / (seen**2).sum()))
         if not 1.0 / OTHER_UNIT < times < OTHER_UNIT:
             raise InputError(
-                f"forces of {name!r} are {1.0 / times:.3g} times those that the parameters of the study give: name the unit in the columns, "
-                "as in fx_N or fx_mN; if it is right, begin with parameters less than a factor of 200 away"
+                f"forces of {name!r} are {1.0 / times:.3g} times those that the parameters of the study give: name the unit in the "
+                "columns, as in fx_N or fx_mN; if it is right, begin with parameters less than a factor of 200 away"
             )
 
 
