@@ -263,6 +263,8 @@ def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:
         return dicom.read if _is_dicom(source) else tiff.read
     if _is_dicom(source):
         return dicom.read
+    if not source.exists() and _ending(source) not in VOLUME_READERS:
+        raise InputError(f"{source}: there is no such file or folder; check the path")
     if source.suffix.lower() in _RAW:
         raise raw_values(source)
     return _of(VOLUME_READERS, source, "read")
