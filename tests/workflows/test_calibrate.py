@@ -136,6 +136,24 @@ def test_records_that_point_the_other_way_are_refused(inputs: tuple[Path, Path, 
 
 
 @pytest.mark.parametrize(
+    ("header", "order", "told"),
+    [
+        ("Time (ms),Fx,Fy,Fz", [0, 1, 2, 3], r"'stamp' are 0\.00\d+ times .* name the unit in the columns, as in fx_N"),
+        ("t,Fx (N),Fy (N),Fz (N)", [0, 1, 2, 3], r"no window holds one; .* as in time_ms"),
+        ("Time (ms),Fx (N),Fy (N),Fz (N)", [0, 1, 3, 2], r"other axes than simulated ones, which they resemble with .*fy along z"),
+    ],
+)
+def test_records_in_another_unit_or_along_other_axes_are_refused(
+    inputs: tuple[Path, Path, Path], tmp_path: Path, header: str, order: list[int], told: str
+) -> None:
+    study, cloud, sensor = inputs
+    rows = [row.split(",") for row in sensor.read_text(encoding="utf-8").splitlines()[1:]]
+    sensor.write_text("\n".join([header, *(",".join(row[k] for k in order) for row in rows)]), encoding="utf-8")
+    with pytest.raises(InputError, match=told):
+        calibrate_study(study, shapes=[cloud], forces=[sensor], out=tmp_path / "out", groups="all")
+
+
+@pytest.mark.parametrize(
     ("factor", "unit", "told"), [(1e-3, "mm", "unit were 1000 times"), (1e3, "mm", "unit were 0.001 times"), (1e3, "m", "x_mm")]
 )
 def test_points_whose_columns_name_another_unit_are_told(

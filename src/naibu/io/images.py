@@ -89,7 +89,7 @@ def read_volume(
         Length of the file's unit, mm: 1000 for metres. By default the unit that the file states, else mm.
     rescaled : bool
         Whether to apply the rescale slope and intercept of DICOM and NIfTI files (to obtain CT numbers in HU, for example). By default the
-        stored values are returned.
+        stored values are returned, but of slices that have different ones, as in PET, which are not comparable without.
     missing : bool
         Whether voxels may be NaN, as outside of a field of view.
 
@@ -263,6 +263,8 @@ def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:
         return dicom.read if _is_dicom(source) else tiff.read
     if _is_dicom(source):
         return dicom.read
+    if not (source.suffix or source.exists()):
+        raise InputError(f"{source}: there is no such file or folder; check the path")
     if source.suffix.lower() in _RAW:
         raise raw_values(source)
     return _of(VOLUME_READERS, source, "read")

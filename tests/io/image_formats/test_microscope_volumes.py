@@ -85,3 +85,8 @@ def test_raw_values_are_read_by_the_header_that_the_message_asks_for(tmp_path: P
     volume = read_volume(tmp_path / "case.mhd")
     np.testing.assert_array_equal(volume.values, VALUES)
     np.testing.assert_allclose(volume.spacing_mm, [0.2, 0.3, 0.5])
+
+
+def test_a_folder_that_is_not_there_is_told_as_such(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file or folder"):
+        read_volume(tmp_path / "dicom_series")

@@ -64,6 +64,16 @@ def test_thousands_are_understood_where_the_decimal_mark_is_known(tmp_path: Path
     np.testing.assert_array_equal(points, [[1234.5, 2.5, 3.0]])
 
 
+def test_labels_of_one_prefix_are_their_numbers(tmp_path: Path) -> None:
+    table = tmp_path / "a.csv"
+    table.write_text("label,x_mm,y_mm,z_mm\nM010,1,2,3\nM002,4,5,6\n", encoding="utf-8")
+    markers = import_markers(table)
+    assert dict(zip(markers.ids.tolist(), markers.points.tolist(), strict=True)) == {10: [1.0, 2.0, 3.0], 2: [4.0, 5.0, 6.0]}
+    table.write_text("label,x_mm,y_mm,z_mm\nA1,1,2,3\nB2,4,5,6\n", encoding="utf-8")  # A1 and B1 may be two markers
+    with pytest.raises(InputError, match=r"'A1' is not a whole number.*the same letters in all rows"):
+        import_markers(table)
+
+
 def test_blank_cells_are_missing_and_status_is_kept(tmp_path: Path) -> None:
     markers = import_markers(table(tmp_path, "id,x,y,z,status\n1,1,,3,missing\n2,1,2,3,suspect\n3,−1,n/a,3,\n"))
     np.testing.assert_array_equal(np.isnan(markers.points[:, 1]), [True, False, True])

@@ -52,6 +52,7 @@ def test_where_field_and_object_are_is_told() -> None:
     [
         (1000.0 * POINTS, r"100 % of the points would lie in it if they were in um; give `unit` um\."),
         (POINTS * [-1.0, -1.0, 1.0], "in RAS; change the signs of x, y, ux and uy"),
+        (POINTS[:, [0, 2, 1]] * [1.0, 1.0, -1.0], "with y upwards; take x, -z, y and ux, -uz, uy"),
         (POINTS + 500.0, r"reference scan\?$"),
     ],
 )

@@ -19,6 +19,7 @@ from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
 
 WINDOW_S = 0.02
 ROUGHNESS = 2e-5  # of chi-squared in contact
+LEAST_WITHIN = 0.02  # of the samples of a record within the study: with fewer, times are likely to have another unit
 FEW, TIMES_OFF = 10, 30.0  # points that tell an extent, and by how many times it may differ from that of the object
 
 
@@ -84,17 +85,19 @@ class RecordedForces:
         windows, bodies = end // each, len(study.bodies)
         if windows == 0:
             raise InputError(
-                f"samples of the forces are {slowest:g} s apart, and the study lasts {end * study.step_s:g} s: no window holds one"
+                f"samples of the forces are {slowest:g} s apart, and the study lasts {end * study.step_s:g} s: no window holds one; "
+                "is the unit of times another one, to be named in the column, as in time_ms?"
             )
         shares = np.full((windows * each, bodies), 1.0 / each)
         sums, samples, sd = np.zeros((windows, bodies, 3)), np.zeros((windows, bodies)), np.full(bodies, np.nan)
         for body, times, force in records:
             place = np.floor(times / (each * study.step_s) - 1e-9).astype(np.int64)
             inside = (times > 0.0) & (place < windows)
-            if not inside.any():
+            if inside.mean() < LEAST_WITHIN:
                 raise InputError(
                     f"the record of {study.bodies[body].name} lasts from {times[0]:g} to {times[-1]:g} s, the study from 0 to "
-                    f"{end * study.step_s:g} s: no sample lies within; give times from the beginning of the motion on"
+                    f"{end * study.step_s:g} s: {inside.sum() or 'no'} of {len(times)} samples lie within; give times from the beginning "
+                    "of the motion on, their unit in the name of the column, as in time_ms, and not what was recorded long before or after"
                 )
             np.add.at(sums[:, body], place[inside], force[inside])
             np.add.at(samples[:, body], place[inside], 1.0)

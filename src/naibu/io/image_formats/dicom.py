@@ -60,14 +60,8 @@ def read(path: Path, options: ReadOptions) -> Volume:
     slices = _sorted_stack(path.name, slices)
     first = slices[0]
     step = _step(path.name, slices)
-    slopes = {s.rescale for s in slices}
-    if len(slopes) > 1 and not options.rescaled:
-        raise InputError(
-            f"{path.name}: its slices have different rescale slopes ({len(slopes)} of them), so their stored values are not comparable; "
-            "read the series in Python with rescaled=True, which applies them, and write it with naibu.io.write_volume"
-        )
     values = _values(pydicom, path.name, slices)
-    if options.rescaled:
+    if options.rescaled or len({s.rescale for s in slices}) > 1:  # stored values of slices with different ones are not comparable
         scale = np.array([s.rescale for s in slices])
         values = values * scale[:, :1, None] + scale[:, 1:, None]
     axes = np.column_stack([first.axes[0] * first.pixel_mm[1], first.axes[1] * first.pixel_mm[0], step])

@@ -86,7 +86,8 @@ def import_markers(
         raise InputError(f"{source}: no rows follow the header {', '.join(header)}; a table needs one row per marker")
     factors = {name: unit_factor(source, header[at], unit) for name, at in where.items() if name in COORDINATES}
     mark = decimal_mark(row[where[name]] for _, row in body for name in factors)
-    ids = [_label(f"{source}: line {line}, column {header[where['marker']]!r}", row[where["marker"]]) for line, row in body]
+    prefix = _common_prefix([row[where["marker"]] for _, row in body])
+    ids = [_label(f"{source}: line {line}, column {header[where['marker']]!r}", row[where["marker"]], prefix) for line, row in body]
     points = np.full((len(body), 3), math.nan)
     for name, factor in factors.items():
         cells = [(f"{source}: line {line}, column {header[where[name]]!r}", row[where[name]]) for line, row in body]
@@ -296,11 +297,20 @@ def _unrecognised(path: Path, header: list[str]) -> str:
     return f'{where}; call them {", ".join(lost)} (in Python columns={{"{lost[0]}": ...}} does){unnumbered}'
 
 
-def _label(where: str, text: str) -> int:
+def _common_prefix(labels: Sequence[str]) -> str:
+    """Return the letters before the number that all labels have in common (``M001``); empty where they differ, for the rest may, too."""
+    before = {re.sub(r"\d+$", "", label) for label in labels}
+    first = next(iter(before))
+    return first if len(before) == 1 and len(labels) > 1 else ""
+
+
+def _label(where: str, text: str, prefix: str) -> int:
     # spreadsheets store whole numbers as 1.0
-    found = re.fullmatch(r"(\d{1,18})(?:[.,]0*)?", text)
+    found = re.fullmatch(r"(\d{1,18})(?:[.,]0*)?", text.removeprefix(prefix))
     if not found:
-        raise InputError(f"{where} = {text!r} is not a whole number; every row needs its marker's number")
+        raise InputError(
+            f"{where} = {text!r} is not a whole number; every row needs its marker's number, alone or after the same letters in all rows"
+        )
     return int(found[1])
 
 

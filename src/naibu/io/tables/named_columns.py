@@ -144,5 +144,8 @@ def _column(path: Path, rows: list[tuple[int, list[str]]], header: list[str], pl
         except ValueError:
             values[k] = np.nan
         if not np.isfinite(values[k]):
-            raise InputError(f"{path}: row {line} has {text[:_SHOWN]!r} in the column {header[column]!r}, where a number belongs")
+            raise InputError(
+                f"{path}: row {line} has {text[:_SHOWN]!r} in the column {header[column]!r}, where a number belongs; "
+                "leave out rows without one"
+            )
     return factor * values

@@ -103,6 +103,8 @@ def _likely_frame(points: FloatArray, inside: Volume) -> str:
     """Return in words in which unit or frame most points would lie in the object, if in one of those that are common; else nothing."""
     tried = {f"in {unit}; give `unit` {unit}": MM_PER_UNIT[unit] * points for unit in ("cm", "m", "um", "inch")}
     tried["in RAS; change the signs of x, y, ux and uy"] = points * [-1.0, -1.0, 1.0]
+    tried["with y upwards; take x, -z, y and ux, -uz, uy for x, y, z and ux, uy, uz"] = points[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
+    tried["in the order z, y, x; exchange the columns x and z, ux and uz"] = points[:, ::-1]
     tried["in voxels; give spacing_mm"] = inside.to_physical(points)
     for told, moved in tried.items():
         index = np.round(inside.to_index(moved)).astype(int)[:, ::-1]

@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from pathlib import Path
 from typing import Any, get_args
 
@@ -34,6 +35,9 @@ from naibu.workflows.studies.calibration_page import Compared, calibration_chapt
 from naibu.workflows.studies.calibration_starts import CalibratedFromStarts, Method, calibrate_from_starts, searched
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
 
+# a record and the forces at the start of the search: correlation with the axes exchanged, and as they are, that tell exchanged axes; and
+# the factor between their sizes from which another unit is more likely than so wrong a start
+OTHER_AXES, SAME_AXES, OTHER_UNIT = 0.9, 0.5, 200.0
 POINT_SD_MM = 0.5  # of the report's stereo cameras :cite:p:`hirai2008`
 
 
@@ -228,16 +232,34 @@ def _problem(
 
 
 def _check_directions(prepared: PreparedStudy, before: Compared) -> None:
-    """Refuse records that hold what the object exerts on the sensor."""
+    """Refuse records that hold what the object exerts on the sensor, along other axes, or in another unit than the one that is named."""
     for body, name in enumerate(b.name for b in prepared.study.bodies):
-        seen, ours = before.measured[:, body], before.force[:, body]
-        counted = np.isfinite(seen)
-        product = float((seen[counted] * ours[counted]).sum())
-        sizes = float(np.sqrt((seen[counted] ** 2).sum() * (ours[counted] ** 2).sum()))
-        if product < -0.5 * sizes < 0.0:
+        counted = np.isfinite(before.measured[:, body])
+        seen, ours = before.measured[:, body][counted[:, 0]], before.force[:, body][counted[:, 0]]
+        sizes = float(np.sqrt((seen**2).sum() * (ours**2).sum()))
+        if not sizes > 0.0:
+            continue
+        products = seen.T @ ours / sizes  # (axis of the record, axis of the study)
+        alike = float(np.trace(products))
+        if alike < -0.5:
             raise InputError(
                 f"forces of {name!r} point the other way than simulated ones; a record holds what the indenter exerts on the object: "
                 "reverse the signs, or check the axes of the sensor"
+            )
+        turned = max(permutations(range(3)), key=lambda order: np.abs(products[list(order), range(3)]).sum())
+        if np.abs(products[list(turned), range(3)]).sum() > OTHER_AXES and alike < SAME_AXES:
+            columns = ", ".join(
+                f"{'-' if products[column, axis] < 0.0 else ''}f{'xyz'[column]} along {'xyz'[axis]}" for axis, column in enumerate(turned)
+            )
+            raise InputError(
+                f"forces of {name!r} act along other axes than simulated ones, which they resemble with {columns}: exchange the columns, "
+                "or turn the paths of the study"
+            )
+        times = float(np.sqrt((ours**2).sum() / (seen**2).sum()))
+        if not 1.0 / OTHER_UNIT < times < OTHER_UNIT:
+            raise InputError(
+                f"forces of {name!r} are {1.0 / times:.3g} times those that the parameters of the study give: name the unit in the "
+                "columns, as in fx_N or fx_mN; if it is right, begin with parameters less than a factor of 200 away"
             )
 
 
