@@ -1,5 +1,8 @@
 """Virtual specimens: lattices come back from their scans, noise is as asked, gels keep their volume, seeds repeat."""
 
+import io
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -126,6 +129,17 @@ def test_the_same_seed_gives_the_same_scan(gel):
     for name in ("initial", "pressed", "more"):
         assert np.array_equal(one.state(name).markers.points, two.state(name).markers.points)
         assert np.abs(one.state(name).markers.points - other.state(name).markers.points).max() > 1
+
+
+def test_a_scan_goes_to_other_processes(gel):
+    seen = gel.scanned(seed=3).experiment
+    sent = io.BytesIO()
+    pickler = pickle.Pickler(sent)
+    pickler.dispatch_table = {}  # without what packages that happen to be loaded taught it
+    pickler.dump(seen)
+    got = pickle.loads(sent.getvalue())
+    assert got.name == seen.name and got.title == seen.title
+    np.testing.assert_array_equal(got.states[1].markers.points, seen.states[1].markers.points)
 
 
 def test_the_same_seed_gives_the_same_phantom():

@@ -308,8 +308,7 @@ def _described(template: Experiment, free: FloatArray) -> Experiment:
     markers = Markers.from_arrays(np.arange(1, len(free) + 1), free)
     states = (replace(first, markers=markers), *(replace(s, markers=None) for s in template.states[1:] if s.loaded))
     exact = replace(template, states=states, base_z_mm=0.0, xy_scale=1.0, xy_step_mm=0.0, z_step_mm=0.0, known_problems=())
-    nothing: MappingProxyType[str, object] = MappingProxyType({})
-    return replace(exact, title=f"virtual twin: {template.title}", source="computed", scanner=nothing, input_hashes=MappingProxyType({}))
+    return replace(exact, title=f"virtual twin: {template.title}", source="computed", scanner={}, input_hashes={})
 
 
 def _complete(experiment: Experiment, model: Specimen, truth: Mapping[str, float]) -> dict[str, float]:
