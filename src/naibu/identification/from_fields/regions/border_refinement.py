@@ -258,6 +258,8 @@ class CorrectedRegions:
         Whether the last correction changed them by next to nothing.
     of_law : bool
         Whether the small cells had the law of the identification each time, rather than small strain.
+    undone : ndarray, shape (2 regions,)
+        A last change of the logarithms that was taken back, as with it small cells left larger residuals.
     """
 
     refined: RefinedRegions
@@ -265,16 +267,18 @@ class CorrectedRegions:
     shift: FloatArray
     converged: bool
     of_law: bool
+    undone: FloatArray
 
     @property
     def doubt(self) -> FloatArray:
         """Covariance (2 regions, 2 regions) of what still smaller cells would change.
 
         Regions share their borders: none is surer than the one that changed most. The ratio of bulk to shear modulus feels flat faces of a
-        curved body as it does without a correction. What small strain changed is doubted whole.
+        curved body as it does without a correction. What small strain changed is doubted whole, and so is a change that was taken back.
         """
         parts = (DOUBT, DOUBT_OF_RATIO) if self.of_law else (1.0, 1.0)
-        return np.diag((np.repeat(parts, len(self.shift) // 2) * float(np.abs(self.shift).max(initial=0.0))) ** 2)
+        taken, undone = (float(np.abs(change).max(initial=0.0)) for change in (self.shift, self.undone))
+        return np.diag((np.repeat(parts, len(self.shift) // 2) * taken) ** 2 + undone**2)
 
 
 def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bounds: Bounds) -> CorrectedRegions | None:
@@ -291,6 +295,7 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     here, now, objective = _Trial(found.theta, found.borders.moves.ravel(), found.point, found.objective), found, Objective(bounds=bounds)
     prior = _prior(mixing)
     residuals, converged, before, least, of_law = tuple[FloatArray, ...](), False, here, np.inf, True
+    undone = np.zeros(n)
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
         finer = changes_on_finer_mesh(at, law if of_law else "linear", now.moduli_on)  # no equilibrium once, none later
@@ -299,7 +304,7 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
         changes, of_law = finer[0], finer[1] == law
         left = sum(float(np.sum((o.residual(u) + c) ** 2)) for o, u, c in zip(model.observed, at.point.states, changes, strict=True))
         if left > least:  # surfaces that follow precise data move differently among smaller cells: no more can be said
-            here = before
+            undone, here = here.theta - before.theta, before
             break
         before, least = here, left
         slopes = mixing.moduli(here.theta, here.moves)[1]
@@ -316,7 +321,7 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
         converged = bool((np.abs(fit.theta[:n]) < np.maximum(CORRECTED, WITHIN * sd)).all())
         if converged:
             break
-    return CorrectedRegions(_with_covariance(model, mixing, here), residuals, here.theta - found.theta, converged, of_law)
+    return CorrectedRegions(_with_covariance(model, mixing, here), residuals, here.theta - found.theta, converged, of_law, undone)
 
 
 def without_errors_of_cells(
