@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +100,21 @@ def test_memory_decides_whether_a_pair_is_measured_block_by_block() -> None:
     assert MemoryPlan.of((512, 512, 512), 1.0).edge < large.edge
     with pytest.raises(InputError, match="memory_gb"):
         MemoryPlan.of((512, 512, 512), 0.2)
+
+
+@pytest.mark.parametrize("processes", [1, 4])
+def test_too_little_memory_is_told_with_what_suffices(processes: int) -> None:
+    shape = (200, 200, 200)
+    with pytest.raises(InputError, match="too little") as refused:
+        MemoryPlan.of(shape, 0.2, processes)
+    told = str(refused.value)
+    assert ("fewer `workers`" in told) == (processes > 1)
+    found = re.search(r"give at least ([\d.]+)", told)
+    assert found is not None
+    least = float(found[1])
+    assert MemoryPlan.of(shape, least, processes).edge >= 32
+    with pytest.raises(InputError, match="too little"):
+        MemoryPlan.of(shape, 0.9 * least, processes)
 
 
 def test_nothing_is_resumed_where_there_is_nothing(pair: tuple[Path, Path], tmp_path: Path) -> None:

@@ -89,9 +89,10 @@ class MemoryPlan:
         left = memory - BASE_MB * processes
         coarse, block = 0.4 * left * 2.0**20 / BYTES_PER_VOXEL, 0.4 * left / processes * 2.0**20 / BLOCK_BYTES
         if coarse < FEWEST or block < LEAST_EDGE**3:
+            least = max(FEWEST * BYTES_PER_VOXEL, LEAST_EDGE**3 * BLOCK_BYTES * processes) / 2.0**20 / 0.4 + BASE_MB * processes
+            number, fewer = ("1 process", "") if processes == 1 else (f"{processes} processes", ", or fewer `workers`")
             raise InputError(
-                f"`memory_gb` allows {memory:.0f} MB, too little for {processes} process{'' if processes == 1 else 'es'}; give more, or "
-                "fewer `workers`"
+                f"`memory_gb` allows {memory:.0f} MB, too little for {number}; give at least {math.ceil(least / 10.0) / 100.0:g}{fewer}"
             )
         factor = None if coarse >= COARSE_VOXELS else thinning_factor(shape, coarse)
         return cls(needed_memory_mb(shape), memory, factor, int(min(EDGE, block ** (1.0 / 3.0))))

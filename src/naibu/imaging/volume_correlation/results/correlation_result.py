@@ -334,20 +334,7 @@ def collected(
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
     valid = np.zeros(volume.shape, dtype=bool)
     valid[box] = _answered(fit, content)
-    axes = [np.arange(n) * s for n, s in zip(volume.shape[::-1], volume.spacing_mm, strict=True)]
-    along = [system.grid.matrix(a, axes[a]) for a in range(3)]
-    vectors = np.full((*volume.shape, 3), np.nan)
-    for k in np.flatnonzero(valid.any(axis=(1, 2))):
-        vectors[k] = separable_slice(along[0], along[1], along[2][k], c)
-    inclusions = np.zeros(volume.shape, np.int32)
-    motions = tuple(inclusion.motion for inclusion in fit.inclusions)
-    for inclusion, motion in zip(fit.inclusions, motions, strict=True):
-        x, y, z = level.index[inclusion.voxels].astype(int).T
-        inclusions[z, y, x] = inclusion.number
-        vectors[z, y, x] = motion.displacement(inclusion.points)
-    if not np.array_equal(volume.direction, np.eye(3)):
-        vectors = vectors @ volume.direction.T
-    vectors[~valid] = np.nan
+    vectors, inclusions = _displacements(volume, fit, c, valid)
     maps = [np.full(volume.shape, np.nan, np.float32) for _ in range(2)]
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
@@ -360,8 +347,27 @@ def collected(
     return CorrelationResult(
         DisplacementField.on_grid(volume, vectors, valid=valid), system.grid, c, volume.direction @ covariance @ volume.direction.T,
         of_strain, of_bias, of_place, bent, dilated, fit.residual_sd,
-        maps[0], maps[1], converged, inclusions, motions, _status(system.grid, volume, converged),
+        maps[0], maps[1], converged, inclusions, tuple(inclusion.motion for inclusion in fit.inclusions),
+        _status(system.grid, volume, converged),
     )  # fmt: skip
+
+
+def _displacements(volume: Volume, fit: CorrelationFit, c: FloatArray, valid: BoolArray) -> tuple[FloatArray, Int32Array]:
+    """Return the displacement of every voxel that is answered, mm, not a number elsewhere, and the numbers of rigid inclusions."""
+    axes = [np.arange(n) * s for n, s in zip(volume.shape[::-1], volume.spacing_mm, strict=True)]
+    along = [fit.system.grid.matrix(a, axes[a]) for a in range(3)]
+    vectors = np.full((*volume.shape, 3), np.nan)
+    for k in np.flatnonzero(valid.any(axis=(1, 2))):
+        vectors[k] = separable_slice(along[0], along[1], along[2][k], c)
+    inclusions = np.zeros(volume.shape, np.int32)
+    for inclusion in fit.inclusions:
+        x, y, z = fit.level.index[inclusion.voxels].astype(int).T
+        inclusions[z, y, x] = inclusion.number
+        vectors[z, y, x] = inclusion.motion.displacement(inclusion.points)
+    if not np.array_equal(volume.direction, np.eye(3)):
+        vectors = vectors @ volume.direction.T
+    vectors[~valid] = np.nan
+    return vectors, inclusions
 
 
 def _answered(fit: CorrelationFit, content: CommonContent) -> BoolArray:
