@@ -172,6 +172,18 @@ def test_the_wrong_law_is_told_by_the_misfit() -> None:
     assert right.noise_factor < 1.2 < 2.0 < wrong.noise_factor
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_fields_with_a_wrong_sign_are_doubted_at_the_start(sign: float) -> None:
+    """A body that grows in all directions where it was pressed; layers that differ by several times are no reason for a doubt."""
+    body = layered("linear")
+    fields = [case.field for case in body.load_cases(sd_mm=0.02)]
+    turned = [DisplacementField.from_arrays(f.points, f.vectors * [1.0, 1.0, sign], sd_mm=0.02) for f in fields]
+    cases = [FieldLoadCase.of(f"push {k}", field, body.mesh, loaded=body.constrained) for k, field in enumerate(turned)]
+    found = identify_field(body.mesh, cases, body.zones(), law="linear")
+    start = next(step for step in found.steps if step.startswith("homogeneous start"))
+    assert ("check signs, axes, units and frame" in start) == (sign < 0.0)
+
+
 def test_the_misfit_is_chi_squared_of_what_is_left() -> None:
     """250 measured components less 150 loaded ones less four moduli a trial; the mean over draws is known to a per cent or so."""
     body = layered(pushes=(PRESS, SHEAR))

@@ -59,12 +59,15 @@ from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segm
 from naibu.identification.from_fields.uncertainty import resolution, resolution_report
 from naibu.identification.from_fields.verdict_within_cells import told_alike
 from naibu.identification.load_case import require_load_cases
+from naibu.mechanics.linear_algebra.multigrid import rigid_body_modes
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4
 NO_REGIONS = "No few regions of one material each explain the measurement: the result is a map under a penalty, without intervals."
 MOST_UNKNOWNS = 120_000  # nodal displacements of the quadratic elements with which regions of a map are refitted
 SEARCH_AT_WEIGHT = SearchSettings(max_iterations=15, tolerance=1e-3)
+DOUBTFUL = 0.3  # of the deformation, by root mean square, from which a homogeneous body that leaves it makes the field itself doubtful
+DOUBTFUL_SD = 5.0  # and standard deviations of the measurement
 UNEXPLAINED = 3.0  # standard deviations of chi squared by which regions may fit worse than the regularised field
 
 
@@ -142,6 +145,19 @@ def identify_field(
     return recipe.free(point) if name is None else recipe.regularized(point, name, weight, segmented)
 
 
+def _doubt(homogeneous: FieldModel, misfit: float) -> str:
+    """Return in words what to check where a homogeneous body explains little of a field; empty where it does not."""
+    modes = rigid_body_modes(homogeneous.computed.points)
+    deformation = sum(float(o.beyond(modes) @ o.data) for o in homogeneous.observed)
+    share, sd = np.sqrt(misfit / deformation) if deformation > 0.0 else 0.0, np.sqrt(misfit / homogeneous.n_free)
+    if share < DOUBTFUL or sd < DOUBTFUL_SD:
+        return ""
+    return (
+        f"; it leaves {100.0 * min(share, 1.0):.0f} % of the deformation unexplained (root mean square; {sd:.3g} standard deviations): "
+        "unless stiffness varies that much, check signs, axes, units and frame of the displacements"
+    )
+
+
 @dataclass(slots=True, eq=False)
 class _Recipe:
     """The steps of an identification, recorded and reported."""
@@ -178,7 +194,7 @@ class _Recipe:
         young, poisson = young_and_poisson(found.point.theta)
         self.record(
             f"homogeneous start: Young's modulus {young[0]:.4g}{zones.unit}, Poisson's ratio {poisson[0]:.3f}, "
-            f"misfit {found.point.misfit:.4g} (noise alone: {self.model.n_free:.4g})"
+            f"misfit {found.point.misfit:.4g} (noise alone: {self.model.n_free:.4g}){_doubt(homogeneous, found.point.misfit)}"
         )
         theta = np.repeat(found.point.theta, zones.count)
         if homogeneous.computed is self.model.computed:

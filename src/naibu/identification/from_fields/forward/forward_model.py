@@ -116,6 +116,11 @@ class Observed:
         """Positions of the measurements (k, d), mm."""
         return self.load_case.field.points[self.load_case.field.valid]
 
+    def beyond(self, modes: FloatArray) -> FloatArray:
+        """Return what of the data (q,) no combination of displacements (n d, m) of all nodes, mm, explains."""
+        columns = self.operator @ modes
+        return np.asarray(self.data - columns @ np.linalg.lstsq(columns, self.data, rcond=None)[0])
+
     def residual(self, u: FloatArray) -> FloatArray:
         """Return the whitened difference (q,) of a displacement (n, d), mm, from the measurements."""
         return np.asarray(self.operator @ u.ravel() - self.data)
