@@ -303,10 +303,10 @@ class _Recipe:
         self.record(
             f"{regions.clusters} clusters made {count} regions ({regions.moved} zones changed sides): misfit {misfit:.4g} without penalty"
         )
-        sharp = self._with_borders(regions, graph) if misfit <= limit else self._explained_within_cells(regions, graph, limit)
-        if sharp is None:
+        if misfit > limit:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
             return replace(self._as_map(field, NO_REGIONS), segmentation=regions)
+        sharp = self._with_borders(regions, graph)
         assert sharp.uncertainty is not None and sharp.verdict is not None  # of regions that were fitted without a penalty
         told = told_alike(sharp.zones.names, sharp.theta, sharp.uncertainty, 0)
         judged = replace(sharp.verdict, limits="; ".join(filter(None, (told, sharp.verdict.limits))))
@@ -316,25 +316,10 @@ class _Recipe:
             identifiability=(*sharp.identifiability, *field.identifiability),
         )  # fmt: skip
 
-    def _explained_within_cells(self, regions: Segmentation, graph: ZoneGraph, limit: float) -> FieldEstimate | None:
-        """Return the fit of regions with borders within cells, where whole cells misfit precise data, if it leaves no more than `limit`."""
-        if not self._may_have_borders(regions, graph):
-            return None
-        try:
-            sharp = self._with_borders(regions, graph)
-        except ConvergenceError:
-            return None
-        explained = sharp.verdict is not None and sharp.verdict.ok and sharp.borders is not None
-        return sharp if explained and sharp.chi_squared <= limit else None
-
-    def _may_have_borders(self, regions: Segmentation, graph: ZoneGraph) -> bool:
-        """Whether there are few regions in a map of single cells."""
-        single = graph.count == int((self.model.zones.of_cell != KNOWN).sum()) and self.model.mesh.dimension == 3
-        return single and 1 < regions.zones.count <= MOST_REGIONS
-
     def _with_borders(self, regions: Segmentation, graph: ZoneGraph) -> FieldEstimate:
         """Return the fit of regions whose borders run through cells, where there are few regions in a map of single cells."""
-        if not self._may_have_borders(regions, graph):
+        single = graph.count == int((self.model.zones.of_cell != KNOWN).sum()) and self.model.mesh.dimension == 3
+        if not single or not 1 < regions.zones.count <= MOST_REGIONS:
             return self._sharp(regions.zones, self._fitted(regions), None)
         try:
             refined = refined_regions(self.model, regions, graph, self.bounds)
