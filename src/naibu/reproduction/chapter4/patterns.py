@@ -139,4 +139,4 @@ def calibrated(lattice: Lattice, captures: tuple[Capture, ...], key: Key, *, nea
 
 def with_interval_factor(estimate: LatticeEstimate, k: int) -> str:
     """Return the text of a parameter's value, and the factor by which its 95 % interval extends up and down."""
-    return f"{estimate.values[k]:.3g} (x/÷ {np.exp(1.96 * np.sqrt(estimate.covariance[k, k])):.2g})"
+    return f"{estimate.values[k]:.3g} (x/÷ {np.exp(1.96 * np.sqrt(estimate.covariance[k, k])):.3g})"
