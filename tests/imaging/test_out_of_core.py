@@ -187,12 +187,12 @@ def test_memory_does_not_grow_with_the_volume(tmp_path: Path) -> None:
         volume = ChunkedVolume.from_array(values, spacing_mm=(1, 1, 1))
         work = lambda v=volume, t=target: stored([chunked_harris_response(v, block=(48, 48, 24))], [t])  # noqa: E731
         work()
-        peaks.append(peak_bytes(work))
+        peaks.append(min(peak_bytes(work) for _ in range(3)))  # Zarr's threads hold more or less of what they read
         in_memory.append(peak_bytes(lambda v=volume: harris_response(v.volume())))
         np.testing.assert_array_equal(target[...], harris_response(volume.volume()))
     assert in_memory[1] > 3.5 * in_memory[0]
-    # but for the list of what is to be done, and blocks that happen to be read ahead; 15 MB more would be in proportion
-    assert peaks[1] - peaks[0] < 0.05 * (in_memory[1] - in_memory[0]) and peaks[1] < 0.1 * in_memory[1]
+    # but for the list of what is to be done
+    assert peaks[1] - peaks[0] < 0.03 * (in_memory[1] - in_memory[0]) and peaks[1] < 0.1 * in_memory[1]
     print(f"peak {peaks[0] / 1e6:.1f}, {peaks[1] / 1e6:.1f} MB in blocks, {in_memory[0] / 1e6:.0f}, {in_memory[1] / 1e6:.0f} MB in memory")
 
 

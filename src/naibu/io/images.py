@@ -21,7 +21,7 @@ from naibu.core.volume import Volume
 from naibu.io.files.paths import require_usable_path
 from naibu.io.files.reading import guarded_reading
 from naibu.io.image_formats import dicom, hdf5, metaimage, nifti, nrrd, ome_zarr, png, tiff, tiff_stack, zarr_store
-from naibu.io.image_formats.geometry import ReadOptions, raw_values
+from naibu.io.image_formats.geometry import ReadOptions, without_header
 
 _Handler = TypeVar("_Handler")
 VOLUME_READERS: dict[str, Callable[[Path, ReadOptions], Volume]] = {
@@ -266,7 +266,7 @@ def _reader(source: Path) -> Callable[[Path, ReadOptions], Volume]:
     if not (source.suffix or source.exists()):
         raise InputError(f"{source}: there is no such file or folder; check the path")
     if source.suffix.lower() in _RAW:
-        raise raw_values(source)
+        raise without_header(source)
     return _of(VOLUME_READERS, source, "read")
 
 

@@ -150,7 +150,7 @@ def no_colours(source: str, samples: int, what: str = "colour samples per voxel"
         raise InputError(f"{source}: has {samples} {what} (RGB or vectors), not one intensity; convert it to greyscale first")
 
 
-def raw_values(path: Path) -> InputError:
+def without_header(path: Path) -> InputError:
     """Return the error of a file of values without a header, which says what header to write."""
     return InputError(
         f"{path.name}: holds values without a header; write a text file {path.stem}.mhd beside it with the lines NDims = 3, "

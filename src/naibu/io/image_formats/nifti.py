@@ -14,7 +14,7 @@ from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.reading import require_plausible, require_regular
-from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, raw_values, three_axes, unit_length, volume_with_axes
+from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, without_header, three_axes, unit_length, volume_with_axes
 
 # codes of the header: vectors, and displacement vectors, whose components are along the axes of the file (nifti1.h)
 _VECTOR, _DISPLACEMENT = 1007, 1006
@@ -37,7 +37,7 @@ def read(path: Path, options: ReadOptions) -> Volume:
     # nibabel's readers raise exceptions of many types
     except Exception as error:
         if path.suffix.lower() == ".img" and not path.with_suffix(".hdr").exists():
-            raise raw_values(path) from error
+            raise without_header(path) from error
         raise InputError(f"{path.name}: cannot be read as NIfTI ({error}); copy the file again") from error
     if stored.dtype.kind not in "biuf":
         raise InputError(

@@ -137,26 +137,25 @@ def _strays(s, k, r, c, gap, low, high, one, two):  # type: ignore[no-untyped-de
 
     It is looked at in quarters, and in the middle of those in which it may lead too far: a distance changes by no more than the way.
     """
-    p, m, most = s.position, k.whole[COUNT], 0.5 * k.real[DISTANCE]
+    p, most = s.position, 0.5 * k.real[DISTANCE]
     x, y, z = from_to(p, r, c)
-    quarter, before, there = 0.25 * np.sqrt(dot(x, y, z, x, y, z)), most, most
+    quarter, before = 0.25 * np.sqrt(dot(x, y, z, x, y, z)), most
     for i in range(1, 5):
-        for middle in range(2):
-            f = 0.25 * i - 0.125 * middle
-            qx, qy, qz = p[r, 0] + f * x, p[r, 1] + f * y, p[r, 2] + f * z
-            if middle:
-                if before + there + quarter <= 2.0 * most:
-                    continue
-                if on_side_of_path(k.points, k.length, k.normals, k.folds, m, qx, qy, qz, low, high, one, two)[0] > most:
-                    return True
-            elif i == 4:
-                there = gap
-            else:
-                there = on_side_of_path(k.points, k.length, k.normals, k.folds, m, qx, qy, qz, low, high, one, two)[0]
-                if there > most:
-                    return True
+        there = _gap_between(k, p, r, c, 0.25 * i, low, high, one, two) if i < 4 else gap
+        if there > most:
+            return True
+        if before + there + quarter > 2.0 * most and _gap_between(k, p, r, c, 0.25 * i - 0.125, low, high, one, two) > most:
+            return True
         before = there
     return False
+
+
+@njit(cache=True, **UNCOUNTED)
+def _gap_between(k, p, r, c, share, low, high, one, two):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return how far from the path lies what is a share of the way from r to c away from r."""
+    x, y, z = from_to(p, r, c)
+    px, py, pz = p[r, 0] + share * x, p[r, 1] + share * y, p[r, 2] + share * z
+    return on_side_of_path(k.points, k.length, k.normals, k.folds, k.whole[COUNT], px, py, pz, low, high, one, two)[0]
 
 
 @njit(cache=True, **UNCOUNTED)

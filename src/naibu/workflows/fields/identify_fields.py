@@ -225,17 +225,18 @@ def identify_fields(
                 cubes, found, stated, most=min(MOST_REFINED, points // POINTS_OF_CELL), law=law, bounds=bounds, progress=progress
             )
     found = told_left_out(found, scanned.covering, given.values)
-    cases = cubes.load_cases
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
-        found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cases),
-        load_cases=cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
+        found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cubes.load_cases),
+        load_cases=cubes.load_cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
         region_at=cubes.region_at,
     )  # fmt: skip
-    doubts, coarse = told = _told(found, cubes)
+    doubts, coarse = _told(found, cubes)
     notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
     own = () if scanned.covering is None else tuple(name for name in scanned.covering.names if name not in given.values)
-    result = FieldIdentification(found, body, stated.relative, notes, sum(told, ()), inside, cubes.cell_of_voxel, scanned.covering, own)
+    result = FieldIdentification(
+        found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel, scanned.covering, own
+    )
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
