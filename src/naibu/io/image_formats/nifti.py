@@ -14,7 +14,7 @@ from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.reading import require_plausible, require_regular
-from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, without_header, three_axes, unit_length, volume_with_axes
+from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, three_axes, unit_length, volume_with_axes, without_header
 
 # codes of the header: vectors, and displacement vectors, whose components are along the axes of the file (nifti1.h)
 _VECTOR, _DISPLACEMENT = 1007, 1006

@@ -227,25 +227,23 @@ def identify_fields(
     found = told_left_out(found, scanned.covering, given.values)
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})
     body = IdentifiedBody.of(
-        found, axes=inside.direction, law=law, relative=stated.relative, strain=max(relative_deformation(c.field) for c in cubes.load_cases),
-        load_cases=cubes.load_cases, provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)},
-        region_at=cubes.region_at,
+        found, axes=inside.direction, law=law, relative=stated.relative, load_cases=cubes.load_cases,
+        strain=max(relative_deformation(case.field) for case in cubes.load_cases),
+        provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)}, region_at=cubes.region_at,
     )  # fmt: skip
-    doubts, coarse = _told(found, cubes)
-    notes = (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer)
+    notes, told = _told(found, cubes, longer)
     own = () if scanned.covering is None else tuple(name for name in scanned.covering.names if name not in given.values)
-    result = FieldIdentification(
-        found, body, stated.relative, notes, (*doubts, *coarse), inside, cubes.cell_of_voxel, scanned.covering, own
-    )
+    result = FieldIdentification(found, body, stated.relative, notes, told, inside, cubes.cell_of_voxel, scanned.covering, own)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
-def _told(found: FieldEstimate, cubes: ObjectOnCubes) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what makes the fields doubtful, and what cubes leave out or count as noise, in words."""
+def _told(found: FieldEstimate, cubes: ObjectOnCubes, longer: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return all that is to be told of a result, and of that what makes the fields doubtful and what cubes leave out or count as noise."""
     corrected, scanned = cubes.region_at is not None and found.mesh_shift is not None, cubes.scanned
     doubts = tuple(told for name, field in scanned.fields for told in beyond_object(name, field, scanned.whole))
     doubts += tuple(told for case in cubes.load_cases for told in doubts_of_field(case.name, case.field))
-    return doubts, (*blurred(cubes.left_out, cubes.wrong, corrected=corrected), *cubes.noise)
+    coarse = (*blurred(cubes.left_out, cubes.wrong, corrected=corrected), *cubes.noise)
+    return (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer), (*doubts, *coarse)
 
 
 def _stated(known: Sequence[str], names: Sequence[str], *, each_cell: bool) -> KnownZones:

@@ -9,7 +9,7 @@ import pytest
 
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import box_indenter, cylindrical_indenter, plane_indenter, spherical_indenter
-from naibu.mechanics.lattices.cpu._contact_kernels import AGREED_FRICTION
+from naibu.mechanics.lattices.cpu.contact._kernels import AGREED_FRICTION
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.contact_state import begin_contact, check_outside
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface

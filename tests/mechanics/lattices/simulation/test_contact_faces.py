@@ -20,7 +20,7 @@ from naibu.mechanics.contact.rigid_indenters import (
     plane_indenter,
     spherical_indenter,
 )
-from naibu.mechanics.lattices.cpu._contact_cells import covered
+from naibu.mechanics.lattices.cpu.contact._cells import covered
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import CLASSES, box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.model.state import ConstrainedNodes

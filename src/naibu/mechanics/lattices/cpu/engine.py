@@ -15,9 +15,9 @@ from naibu._numba.thread_pool import MOST_PARTS
 from naibu.core.arrays import AnyFloatArray, FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.mechanics.lattices.cpu.contact_stepper import PASSES, ContactStepper
+from naibu.mechanics.lattices.cpu.contact.explicit import element_forces_of
+from naibu.mechanics.lattices.cpu.contact.stepper import PASSES, ContactStepper
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks, explicit_kernel, implicit_kernel
-from naibu.mechanics.lattices.cpu.explicit_contact import element_forces_of
 from naibu.mechanics.lattices.cpu.scratch import KernelTuple, Scratch, ScratchPool
 from naibu.mechanics.lattices.cpu.session import LatticeSession
 from naibu.mechanics.lattices.cpu.stepper import ExplicitStepper, ImplicitStepper, Stepper

@@ -12,7 +12,7 @@ import numpy as np
 from naibu._numba.intrinsics.simd import WIDTH, aligned
 from naibu._numba.thread_pool import new_control
 from naibu.core.arrays import AnyArray, AnyFloatArray, FloatArray, IntArray
-from naibu.mechanics.lattices.cpu._contact_operator import new_operator
+from naibu.mechanics.lattices.cpu.contact._operator import new_operator
 
 KernelTuple = tuple[Any, ...]  # arrays and numbers as kernels take them, in nested tuples, whose types Numba works out
 PackedArguments = Any  # of `naibu._numba.intrinsics.packed_tuples.packed`

@@ -17,7 +17,7 @@ from naibu.core.errors import InputError
 from naibu.mechanics.contact.indenter_motion import IndenterForce, IndenterMotion, indenter_velocities
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.contact.session_protocol import StepForces
-from naibu.mechanics.lattices.cpu.contact_stepper import ContactStepper, DrivenIndenter
+from naibu.mechanics.lattices.cpu.contact.stepper import ContactStepper, DrivenIndenter
 from naibu.mechanics.lattices.cpu.stepper import Stepper
 from naibu.mechanics.lattices.model.contact_state import ContactState, begin_contact
 from naibu.mechanics.lattices.model.contact_surface import ContactSurface

@@ -12,7 +12,7 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.indenter_motion import IndenterForce
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.mechanics.lattices.cpu.contact_stepper import PASSES, ContactStepper, DrivenIndenter
+from naibu.mechanics.lattices.cpu.contact.stepper import PASSES, ContactStepper, DrivenIndenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.cpu.scratch import Scratch
 from naibu.mechanics.lattices.cpu.session import BALANCE

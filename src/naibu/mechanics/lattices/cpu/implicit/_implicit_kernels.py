@@ -20,7 +20,7 @@ import numpy as np
 from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
 from naibu._numba.intrinsics.simd import WIDTH, load, splat, store
 from naibu._numba.thread_pool import begin_step, end_step
-from naibu.mechanics.lattices.cpu._contact_operator import FACES, ROOM, add_contact
+from naibu.mechanics.lattices.cpu.contact._operator import FACES, ROOM, add_contact
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import begin_with, follow
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import dot, solve
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import ALIGN, CHANGE, FURTHER, MULTIPLY_FULL, NORM, OPERATOR, POOL, share, summed

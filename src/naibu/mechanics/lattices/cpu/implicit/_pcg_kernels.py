@@ -11,7 +11,7 @@ import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
 from naibu._numba.intrinsics.simd import WIDTH, load, splat, total
-from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, ROOM, add_contact, add_preconditioned, extra_energy
+from naibu.mechanics.lattices.cpu.contact._operator import FACES, NODES, ROOM, add_contact, add_preconditioned, extra_energy
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import CREDIT, correct
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import (
     BEGIN,

@@ -14,12 +14,12 @@ from naibu.core.arrays import AnyArray, FloatArray, IntArray
 from naibu.mechanics.contact.indenter_geometry import GeometryArrays, packed_geometries
 from naibu.mechanics.contact.indenter_motion import SHARE, step_parts
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.mechanics.lattices.cpu._contact_kernels import contact_steps
-from naibu.mechanics.lattices.cpu._contact_multipliers import COLUMNS
-from naibu.mechanics.lattices.cpu._contact_operator import new_operator
-from naibu.mechanics.lattices.cpu._contact_points import COLUMNS as POINT_COLUMNS
-from naibu.mechanics.lattices.cpu._contact_points import RESULTS, new_room, rest_at
-from naibu.mechanics.lattices.cpu.explicit_contact import ElementForces, no_elements
+from naibu.mechanics.lattices.cpu.contact._kernels import contact_steps
+from naibu.mechanics.lattices.cpu.contact._multipliers import COLUMNS
+from naibu.mechanics.lattices.cpu.contact._operator import new_operator
+from naibu.mechanics.lattices.cpu.contact._points import COLUMNS as POINT_COLUMNS
+from naibu.mechanics.lattices.cpu.contact._points import RESULTS, new_room, rest_at
+from naibu.mechanics.lattices.cpu.contact.explicit import ElementForces, no_elements
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, TOUCHED
 from naibu.mechanics.lattices.cpu.implicit._solver_parts import COARSE, POOL
 from naibu.mechanics.lattices.cpu.implicit._step_parts import implicit_worker

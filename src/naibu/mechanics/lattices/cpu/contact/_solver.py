@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, ROOM, ROUGH_ROOM, add_contact
+from naibu.mechanics.lattices.cpu.contact._operator import FACES, NODES, ROOM, ROUGH_ROOM, add_contact
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import CREDIT
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import first_residual, settle
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import conjugate_gradients, project, residual_norm

@@ -31,8 +31,8 @@ from naibu.mechanics.contact._geometry_kernels import (
     mesh_of,
     signed_distance,
 )
-from naibu.mechanics.lattices.cpu._contact_cells import covered_within, facing, is_far, near_flat, opposite_side, pressed, pressed_by_edge
-from naibu.mechanics.lattices.cpu._contact_operator import FACES
+from naibu.mechanics.lattices.cpu.contact._cells import covered_within, facing, is_far, near_flat, opposite_side, pressed, pressed_by_edge
+from naibu.mechanics.lattices.cpu.contact._operator import FACES
 
 FREE, STICK, SLIDE = range(3)
 TANGENTIAL = 16.7  # stiffness of a point before it slips, of a foundation one element thick: the area in contact does not matter to it

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
-from naibu.mechanics.lattices.cpu._contact_points import ALONG, BORNE, OWN, TOUCHING, UNDER, exerted
+from naibu.mechanics.lattices.cpu.contact._points import ALONG, BORNE, OWN, TOUCHING, UNDER, exerted
 from naibu.mechanics.lattices.model.contact_surface import PER_RADIUS, SHARED, THINNEST
 
 EARNEST = 0.25  # covered fraction of a face that counts

@@ -6,7 +6,7 @@ import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.mechanics.contact._geometry_kernels import mesh_of
-from naibu.mechanics.lattices.cpu._contact_points import ALONG, FORCE, FREE, HARD, OWN, SLIDE, STICK, TANGENT, TOUCHING, gap_of
+from naibu.mechanics.lattices.cpu.contact._points import ALONG, FORCE, FREE, HARD, OWN, SLIDE, STICK, TANGENT, TOUCHING, gap_of
 
 GONE = 1e-9  # compression of a foundation that counts as none, mm
 

@@ -1,6 +1,6 @@
 """Implicit steps of a lattice in unilateral contact with Coulomb friction: a semismooth Newton iteration settles every step.
 
-The contact conditions hold at the quadrature points of the faces (`_contact_points`) for the solution at the end of the step. A pass solves
+The contact conditions hold at the quadrature points of the faces (`_points`) for the solution at the end of the step. A pass solves
 a step with the contact linearized about the solution of the pass before, until what the points exert agrees with what they ought to.
 Where the tolerance is loose, the first passes are solved roughly, as inexact Newton methods do :cite:p:`eisenstat1996`; the last one is
 solved to the tolerance.
@@ -12,11 +12,12 @@ import numpy as np
 
 from naibu._numba.compilation import UNCOUNTED, njit
 from naibu._numba.thread_pool import begin_step, end_step
-from naibu.mechanics.lattices.cpu._contact_history import keep, pull_off
-from naibu.mechanics.lattices.cpu._contact_multipliers import settle_multipliers, update_multipliers
-from naibu.mechanics.lattices.cpu._contact_operator import FACES, NODES, close_operator
-from naibu.mechanics.lattices.cpu._contact_points import SLIDE, assemble, look, near_faces
-from naibu.mechanics.lattices.cpu._contact_solver import (
+from naibu.mechanics.lattices.cpu._explicit_kernels import forces_of_elements
+from naibu.mechanics.lattices.cpu.contact._history import keep, pull_off
+from naibu.mechanics.lattices.cpu.contact._multipliers import settle_multipliers, update_multipliers
+from naibu.mechanics.lattices.cpu.contact._operator import FACES, NODES, close_operator
+from naibu.mechanics.lattices.cpu.contact._points import SLIDE, assemble, look, near_faces
+from naibu.mechanics.lattices.cpu.contact._solver import (
     change_contacts,
     extrapolate,
     forget_impulses,
@@ -25,7 +26,6 @@ from naibu.mechanics.lattices.cpu._contact_solver import (
     solve_exactly,
     solve_roughly,
 )
-from naibu.mechanics.lattices.cpu._explicit_kernels import forces_of_elements
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import LATEST, begin_with, follow_contacts
 from naibu.mechanics.lattices.cpu.implicit._implicit_kernels import SETUP, add_momenta, add_reactions, advance
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import residual_norm
