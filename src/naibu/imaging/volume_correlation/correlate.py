@@ -25,6 +25,7 @@ from threadpoolctl import threadpool_limits
 
 from naibu.core.arrays import BoolArray, Float32Array, FloatArray, Int32Array
 from naibu.core.errors import InputError
+from naibu.core.memory import return_freed_memory
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
@@ -276,6 +277,7 @@ class Correlation:
             if 0 < k <= HALVINGS:
                 self.c, self.grid = self.grid.refined(self.c), self.grid.halved()
             if k == 0 or stride != self.strides[k - 1]:
+                return_freed_memory()
                 level = self.level(stride, self.settings.smoothing_voxels)
             system = SplineSystem(level, self.grid, self.ratio)
             self.bending, self.dilatation = self.weights(system, LEVELS[k].bending)
@@ -327,6 +329,7 @@ class Correlation:
     def adapt(self) -> None:
         """Choose the weights of the penalties by the data, and fit once more."""
         fit, system, s = self.fit, self.fit.system, self.settings
+        return_freed_memory()  # of coarser levels
         self.follow_inclusions()
         if not s.adaptive_weight:
             return
@@ -417,18 +420,22 @@ class Correlation:
         system.assembled(self.c, fit.products, fit.force, self.bending, dilatation, system.matrix, voxels=False)  # of the intensities
         require_overlap(float(fit.seen.mean()))
         refuse_unrelated(fit)
+        return_freed_memory()  # of the steps
         content = common_content(fit, fit.level.depth_mm(self.mask))
         content.refuse_chance(system.inner)
         require_convergence(fit.moving_fraction)
         for inclusion in self.inclusions:
             inclusion.draws.clear()
+        misfit = fit.cell_misfit()
+        fit.agreement = fit.agreement[:0].copy()  # the draws need its memory
+        return_freed_memory()
         noise = self.noise()
         drawn = fit.noise_samples(LATE_DRAWS, noise, self.settings.seed + 3)
         hidden = self.hidden(tried, drawn, noise.scale)
         samples = fit.samples(self.c, self.bending, dilatation, self.settings.samples, noise, self.settings.seed + 1)
         blocks = block_displacements(self.volume, fit, noise, self.settings.seed + 2, content.unlike)
         contrasts = partial(self.contrasts, noise, drawn)
-        found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content, fit.cell_misfit(), hidden, contrasts)
+        found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content, misfit, hidden, contrasts)
         return replace(found, blocks=blocks)
 
 

@@ -92,6 +92,11 @@ class CorrelationFit(IntensityComparison):
         self.last_step = np.zeros((system.n, 3), np.float32)
         self.still_mm = STILL * float(np.prod(level.spacing) ** (1 / 3))
 
+    def forget_equations(self) -> None:
+        """Let go of what only further steps and errors need, most of the memory of a fit; displacement, gain and offset stay."""
+        self.products = self.agreement = self.force = self.gradient = self.reference_gradient = np.zeros((0, 3), np.float32)
+        self.system.matrix = np.zeros((0, 3, 3), np.float32)
+
     @cached_property
     def cell_of_voxel(self) -> IntArray:
         """Number of the cell of every listed voxel (n,)."""

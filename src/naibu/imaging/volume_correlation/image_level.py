@@ -104,8 +104,13 @@ class ImageLevel:
         low, high = np.maximum(self.low - 1, 0), self.high + 1
         box = tuple(slice(int(a), int(b)) for a, b in zip(low, high, strict=True))
         inner = tuple(slice(int(a), int(b)) for a, b in zip(self.low - low, self.high - low, strict=True))
-        depth = ndimage.distance_transform_edt(mask[box], sampling=self.spacing[::-1])
-        return np.asarray(depth[inner][self.mask], dtype=np.float32)
+        # SciPy's distances of a whole box take four times the memory of the places of its nearest voxels
+        nearest = ndimage.distance_transform_edt(mask[box], sampling=self.spacing[::-1], return_distances=False, return_indices=True)
+        squared = np.zeros(len(self.index), np.float32)
+        for axis in range(3):
+            own = self.index[:, 2 - axis] - np.float32(low[axis])
+            squared += ((nearest[axis][inner][self.mask] - own) * np.float32(self.spacing[2 - axis])) ** 2
+        return np.sqrt(squared)
 
     def listed(self, values: BoolArray) -> BoolArray:
         """Return the values (n,) of an image (nz, ny, nx), on the grid of this level, at the listed voxels."""

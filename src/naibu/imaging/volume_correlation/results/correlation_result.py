@@ -330,6 +330,7 @@ def collected(
     strain_sd = np.sqrt(
         strain_variance(fit, c, samples, bias) + hidden[1] + strained + (remaining + misplaced) / float(system.grid.step_mm.min()) ** 2
     )
+    fit.forget_equations()
     return_freed_memory()
     box = tuple(slice(int(a), int(b)) for a, b in zip(level.low, level.high, strict=True))
     valid = np.zeros(volume.shape, dtype=bool)
@@ -338,7 +339,7 @@ def collected(
     maps = [np.full(volume.shape, np.nan, np.float32) for _ in range(2)]
     for full, listed in zip(maps, (fit.gain, fit.offset), strict=True):
         full[box][level.mask] = listed
-        full[~valid] = np.nan
+        np.putmask(full, ~valid, np.nan)
     converged = np.ones(tuple(int(n) for n in system.grid.cells[::-1]), dtype=bool)
     converged[tuple(system.cells[:, 2:].T)] = ~fit.moving | ~system.inner
     of_strain, of_bias, of_place, bent, dilated = (
@@ -357,7 +358,8 @@ def _displacements(volume: Volume, fit: CorrelationFit, c: FloatArray, valid: Bo
     axes = [np.arange(n) * s for n, s in zip(volume.shape[::-1], volume.spacing_mm, strict=True)]
     along = [fit.system.grid.matrix(a, axes[a]) for a in range(3)]
     vectors = np.full((*volume.shape, 3), np.nan)
-    for k in np.flatnonzero(valid.any(axis=(1, 2))):
+    some = np.flatnonzero(valid.any(axis=(1, 2)))
+    for k in some:
         vectors[k] = separable_slice(along[0], along[1], along[2][k], c)
     inclusions = np.zeros(volume.shape, np.int32)
     for inclusion in fit.inclusions:
@@ -366,7 +368,8 @@ def _displacements(volume: Volume, fit: CorrelationFit, c: FloatArray, valid: Bo
         vectors[z, y, x] = inclusion.motion.displacement(inclusion.points)
     if not np.array_equal(volume.direction, np.eye(3)):
         vectors = vectors @ volume.direction.T
-    vectors[~valid] = np.nan
+    for k in some:  # the places of all slices at once would take as much memory as the vectors
+        vectors[k][~valid[k]] = np.nan
     return vectors, inclusions
 
 
