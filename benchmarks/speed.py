@@ -54,6 +54,7 @@ COLUMNS = {
         "time, s",
         "peak memory, MB",
         "exponent of growth from the size before",
+        "memory of an unknown more than that size has, kB",
     ),
     "lattice": ("program", "elements", "processor time of a step, ms", "ratio to the plain loop"),
     "sensing": ("method", "voxels", "processor time, s", "mean error, voxel"),
@@ -95,7 +96,7 @@ def hyperelastic(quick: bool, repeats: int) -> Rows:
     """Each size in a process of its own, so that its peak of memory is its own."""
     rows: Rows = []
     for label, script, cells_most in (("compression by 25 %", fe_compression, 80), ("gradient", fe_gradient, GRADIENT_MOST)):
-        before = None
+        before: tuple[int, float, float, int] | None = None
         for cells in (*HYPERELASTIC, *(() if quick else MORE_HYPERELASTIC)):
             if cells > cells_most:
                 continue
@@ -103,9 +104,14 @@ def hyperelastic(quick: bool, repeats: int) -> Rows:
             if absent:
                 raise RuntimeError(f"{label}, {cells} cells an edge: {absent['naibu']}")
             seconds, memory, _, busy = np.min([run["numbers"] for run in found["naibu"]], axis=0)
-            growth = "" if before is None else float(np.log(busy / before[1]) / np.log((cells / before[0]) ** 3))
-            rows.append((label, 6 * cells**3, busy, seconds, memory, growth))
-            before = cells, busy
+            unknowns = 3 * (cells + 1) ** 3
+            growth: Cell = ""
+            each: Cell = ""
+            if before is not None:
+                growth = float(np.log(busy / before[1]) / np.log((cells / before[0]) ** 3))
+                each = 1024.0 * (memory - before[2]) / (unknowns - before[3])
+            rows.append((label, 6 * cells**3, busy, seconds, memory, growth, each))
+            before = cells, busy, memory, unknowns
     return rows
 
 

@@ -10,6 +10,8 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.resampling import require_mask
 
+AT_ONCE = 2**18  # voxels whose Jacobians are found at once, about: gradients take nine numbers a voxel
+
 
 def displacement_gradient(displacement: ArrayLike, grid: Volume) -> FloatArray:
     """Return ``du_a / dx_b`` (nz, ny, nx, 3, 3), a before b, by central differences; zero along the normal of a single slice.
@@ -35,10 +37,16 @@ def displacement_gradient(displacement: ArrayLike, grid: Volume) -> FloatArray:
 
 def jacobian_determinant(displacement: ArrayLike, grid: Volume) -> FloatArray:
     """Return the volume ratio ``det(I + du/dx)`` (nz, ny, nx); the field folds where it is not positive."""
-    gradient = displacement_gradient(displacement, grid)
-    known = np.isfinite(gradient).all(axis=(-2, -1))
-    out = np.full(known.shape, np.nan)
-    out[known] = np.linalg.det(np.eye(3) + gradient[known])
+    u = np.asarray(displacement, dtype=float)
+    if u.shape != (*grid.shape, 3):
+        raise InputError(f"displacement must have shape {(*grid.shape, 3)} (z, y, x, component), mm, not {u.shape}")
+    nz, ny, nx = grid.shape
+    some, out = max(1, AT_ONCE // (ny * nx)), np.full(grid.shape, np.nan)
+    for k in range(0, nz, some):
+        low, high = max(k - 1, 0), min(k + some + 1, nz)  # differences reach a slice further
+        gradient = displacement_gradient(u[low:high], grid.cropped((0, 0, low), (nx, ny, high)))[k - low : k - low + some]
+        known = np.isfinite(gradient).all(axis=(-2, -1))
+        out[k : k + some][known] = np.linalg.det(np.eye(3) + gradient[known])
     return out
 
 

@@ -20,6 +20,7 @@ from naibu.imaging.preprocessing._interpolation_kernels import EDGE, sample, sam
 from naibu.imaging.preprocessing.filters import smoothed
 
 Interpolation = Literal["linear", "cubic"]
+AT_ONCE = 2**18  # voxels that are warped at once, about: what is known of each takes eight times its memory
 COINCIDENT = 1e-3  # largest distance, in voxels, of voxels that are taken for the same: coordinates in headers are rounded
 
 
@@ -242,9 +243,16 @@ def warped(
     u = np.asarray(displacement, dtype=float)
     if u.shape != (*grid.shape, 3):
         raise InputError(f"displacement must have shape {(*grid.shape, 3)} (z, y, x, component), mm, not {u.shape}")
-    ends = positions(grid)
-    ends += u
-    return sampled(volume, ends, interpolation=interpolation, outside=outside)
+    nz, ny, nx = grid.shape
+    # cubic interpolation finds the coefficients of its splines anew each time
+    some = max(1, AT_ONCE // (ny * nx)) if interpolation == "linear" else nz
+    ready = volume.with_values(np.ascontiguousarray(volume.values, dtype=_real(volume.values)))
+    out = np.empty(grid.shape)
+    for k in range(0, nz, some):
+        ends = positions(grid.cropped((0, 0, k), (nx, ny, min(k + some, nz))))
+        ends += u[k : k + some]
+        out[k : k + some] = sampled(ready, ends, interpolation=interpolation, outside=outside)
+    return out
 
 
 def positions(grid: Volume) -> FloatArray:

@@ -311,7 +311,9 @@ def figures(pair: Pair, measured: MeasuredDisplacement) -> dict[str, float | int
         "measured_fraction": float(inside.sum() / measured.mask.sum()),
         "median_displacement_mm": float(np.median(size)),
         "largest_displacement_mm": float(size.max()),
-        "initial_residual_rms": intensity_rms(pair.reference, pair.deformed, np.zeros_like(u), region=measured.mask, frame="reference"),
+        "initial_residual_rms": intensity_rms(
+            pair.reference, pair.deformed, np.broadcast_to(0.0, u.shape), region=measured.mask, frame="reference"
+        ),
         "residual_rms": intensity_rms(pair.reference, pair.deformed, u, region=measured.mask, frame="reference"),
         "folded_fraction": folded_fraction(u, pair.reference, measured.mask),
         "median_sd_mm": None if sd is None else float(np.nanmedian(sd[inside])),
@@ -424,5 +426,5 @@ def _as_markers(measured: MeasuredDisplacement, grid: Volume) -> tuple[Markers, 
     some = np.zeros(grid.shape, dtype=bool)
     some[tuple(slice(k // 2, None, k) for k in every)] = True
     some &= good
-    points, ids = grid.positions()[some], np.arange(1, int(some.sum()) + 1)
+    points, ids = grid.to_physical(np.argwhere(some)[:, ::-1]), np.arange(1, int(some.sum()) + 1)
     return Markers.from_arrays(ids, points), Markers.from_arrays(ids, points + measured.displacement.vectors[some])

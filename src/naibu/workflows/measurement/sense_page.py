@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from naibu.core.arrays import AnyFloatArray, BoolArray, FloatArray
+from naibu.core.arrays import AnyFloatArray, BoolArray
 from naibu.imaging.displacement.strain import green_lagrange_strain_of
 from naibu.imaging.preprocessing.resampling import warped
 from naibu.viewer.cards import Card
@@ -24,15 +24,13 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
     u = measured.displacement.vectors
     back = warped(pair.deformed, np.nan_to_num(u), grid)
     inside = measured.mask & np.isfinite(measured.gradient).all(axis=(-2, -1))
-    principal = np.full((*grid.shape, 3), np.nan)
-    principal[inside] = np.linalg.eigvalsh(green_lagrange_strain_of(measured.gradient[inside]))
-    ratio = np.full(grid.shape, np.nan)
-    ratio[inside] = np.linalg.det(np.eye(3) + measured.gradient[inside])
+    gradient = measured.gradient[inside]
+    principal, ratio = np.linalg.eigvalsh(green_lagrange_strain_of(gradient)), np.linalg.det(np.eye(3) + gradient)
     overlays = [
-        Overlay("displacement, mm", np.linalg.norm(u, axis=-1)[box]),
-        Overlay("largest principal Green-Lagrange strain", principal[..., 2][box]),
-        Overlay("smallest principal Green-Lagrange strain", principal[..., 0][box]),
-        Overlay("volume ratio J", ratio[box], middle=1.0),
+        Overlay("displacement, mm", np.linalg.norm(u[box], axis=-1)),
+        Overlay("largest principal Green-Lagrange strain", _placed(principal[:, 2], inside)[box]),
+        Overlay("smallest principal Green-Lagrange strain", _placed(principal[:, 0], inside)[box]),
+        Overlay("volume ratio J", _placed(ratio, inside)[box], middle=1.0),
     ]
     if (sd := measured.displacement.largest_sd_mm) is not None:
         overlays.append(Overlay("standard deviation of the displacement, mm", np.where(measured.mask, sd, np.nan)[box]))
@@ -44,14 +42,21 @@ def slice_view(pair: Pair, run: SenseRun) -> SliceView:
         sentences=_sentences(run),
         spacing_mm=grid.spacing_mm,
         images=[(name, np.asarray(v, dtype=np.float32)[box]) for name, v in images],
-        displacement=(u @ grid.direction)[box],
+        displacement=u[box] @ grid.direction,
         overlays=overlays,
         tables=[_table(run)],
         origin_mm=grid.to_physical([b.start for b in box[::-1]]) @ grid.direction,
         difference=(("reference minus deformed", 0, 1), ("reference minus deformed, warped back", 0, 2)),
         direction=grid.direction,
-        cards=_cards(run, principal[inside]),
+        cards=_cards(run, principal),
     )
+
+
+def _placed(values: AnyFloatArray, where: BoolArray) -> AnyFloatArray:
+    """Return values (n,) at some voxels (nz, ny, nx), and NaN elsewhere."""
+    out = np.full(where.shape, np.nan, np.float32)
+    out[where] = values
+    return out
 
 
 def middle_slice(pair: Pair, run: SenseRun) -> list[tuple[str, AnyFloatArray, str]]:
@@ -70,7 +75,7 @@ def middle_slice(pair: Pair, run: SenseRun) -> list[tuple[str, AnyFloatArray, st
     return fields
 
 
-def _cards(run: SenseRun, principal: FloatArray) -> tuple[Card, ...]:
+def _cards(run: SenseRun, principal: AnyFloatArray) -> tuple[Card, ...]:
     """Return what to know first; `principal` are the principal Green-Lagrange strains (n, 3) inside the object, in increasing order."""
     f = run.figures
     sd = f["median_sd_mm"]
