@@ -70,6 +70,7 @@ def identify(
     unit: Unit | None = None,
     spacing_mm: tuple[float, float, float] | None = None,
     node_spacing: tuple[float, float, float] | None = None,
+    check_components: bool = True,
     overwrite: Overwrite = False,
     where: WorkerOptions | None = None,
 ) -> None:
@@ -122,6 +123,8 @@ def identify(
         With fields in voxels (SPAM, ALDVC): size of a voxel along x, y, z.
     node_spacing
         With TIFF files of SPAM: voxels from node to node along x, y, z.
+    check_components
+        With fields: refuse those that would suit an elastic body far better with components of other signs or in another order.
     overwrite
         Replace results, or files of your own, that the folder already holds.
     """
@@ -129,7 +132,7 @@ def identify(
     others = [name for name in experiments if name not in of_fields]
     of_scan: dict[str, Any] = {
         "mask": mask, "zones": zones, "zone_name": zone_name or [], "known": known or (), "loaded": loaded or (), "unit": unit,
-        "spacing_mm": spacing_mm, "node_spacing": node_spacing, "out": out, "overwrite": overwrite,
+        "spacing_mm": spacing_mm, "node_spacing": node_spacing, "check_components": check_components, "out": out, "overwrite": overwrite,
     }  # fmt: skip
     if not (of_fields and others) and (mask is not None or zones is not None or not others):
         require_left_out(
@@ -152,6 +155,7 @@ def identify(
     require_left_out(
         "goes with displacement fields, and these are markers", zone_names=bool(zone_name), each_cell=cell_map, unit=unit is not None,
         spacing_mm=spacing_mm is not None, node_spacing=node_spacing is not None, loaded=bool(loaded),
+        check_components=not check_components,
     )  # fmt: skip
     _identify(
         experiments, known=known or (), states=_states(experiments, state or []), settings=settings, out=out,

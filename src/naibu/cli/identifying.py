@@ -42,6 +42,7 @@ def identify_from_fields(
     unit: Unit | None,
     spacing_mm: tuple[float, float, float] | None,
     node_spacing: tuple[float, float, float] | None,
+    check_components: bool,
     out: Path,
     overwrite: bool,
 ) -> None:
@@ -54,8 +55,8 @@ def identify_from_fields(
     with progress_display() as progress:
         result = identify_fields(
             fields, mask=mask, zones=zones, zone_names=labels_of(zone_name), known=known, loaded=loaded, each_cell=each_cell,
-            element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing, out=out,
-            overwrite=overwrite, progress=progress,
+            element_size_mm=element_size_mm, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing,
+            check_components=check_components, out=out, overwrite=overwrite, progress=progress,
         )  # fmt: skip
     usable = result.estimate.verdict is None or result.estimate.verdict.ok
     for number, line in enumerate(result.notes):
@@ -85,6 +86,7 @@ def identify_from_both(
     unit: Unit | None,
     spacing_mm: tuple[float, float, float] | None,
     node_spacing: tuple[float, float, float] | None,
+    check_components: bool,
     out: Path,
     overwrite: bool,
 ) -> None:
@@ -95,7 +97,7 @@ def identify_from_both(
     with progress_display() as progress:
         result = identify_jointly(
             experiments, fields, known=known, states=states, settings=settings, mask=mask, zones=zones, zone_names=labels_of(zone_name),
-            loaded=loaded, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing,
+            loaded=loaded, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing, check_components=check_components,
             element_size_mm=settings.element_size_mm, out=out, overwrite=overwrite, progress=progress,
         )  # fmt: skip
     for line in result.notes:

@@ -100,6 +100,7 @@ def identify_jointly(
     unit: str | None = None,
     spacing_mm: Sequence[float] | None = None,
     node_spacing: Sequence[float] | None = None,
+    check_components: bool = True,
     element_size_mm: float = 0.0,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -114,7 +115,7 @@ def identify_jointly(
     ----------
     experiments, settings, states
         As for `naibu.workflows.identify`.
-    fields, mask, zones, zone_names, loaded, unit, spacing_mm, node_spacing
+    fields, mask, zones, zone_names, loaded, unit, spacing_mm, node_spacing, check_components
         As for `naibu.workflows.identify_fields`.
     out : path-like
         Folder for ``model.json``, ``joint.json`` and ``report.html``, and for the results of either kind in ``markers`` and ``fields``.
@@ -147,7 +148,8 @@ def identify_jointly(
         )
     from_fields = identify_fields(
         fields, mask=mask, zones=zones, zone_names=zone_names, known=of_fields, loaded=loaded, unit=unit, spacing_mm=spacing_mm,
-        node_spacing=node_spacing, element_size_mm=element_size_mm, out=folder / FIELDS, overwrite=overwrite, progress=progress,
+        node_spacing=node_spacing, check_components=check_components, element_size_mm=element_size_mm, out=folder / FIELDS,
+        overwrite=overwrite, progress=progress,
     )  # fmt: skip
     from_markers = identify(
         loaded_experiments, known=of_markers, settings=settings, states=states, out=folder / MARKERS, overwrite=overwrite, progress=progress

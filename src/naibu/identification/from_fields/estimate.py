@@ -148,7 +148,7 @@ def identify_field(
 def _doubt(homogeneous: FieldModel, misfit: float) -> str:
     """Return in words what to check where a homogeneous body explains little of a field; empty where it does not."""
     modes = rigid_body_modes(homogeneous.computed.points)
-    deformation = sum(float(o.beyond(modes) @ o.data) for o in homogeneous.observed)
+    deformation = sum(float(o.beyond(modes, o.data) @ o.data) for o in homogeneous.observed)
     share, sd = np.sqrt(misfit / deformation) if deformation > 0.0 else 0.0, np.sqrt(misfit / homogeneous.n_free)
     if share < DOUBTFUL or sd < DOUBTFUL_SD:
         return ""

@@ -24,7 +24,6 @@ from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import KNOWN
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
-from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.mesh_error import TOO_COARSE
 from naibu.identification.from_fields.regions.relative_map import identify_relative_map
 from naibu.identification.from_fields.uncertainty import MESH_DEPENDENT, NOT_DETERMINED, NOT_USABLE, POISSON_POORLY, Uncertainty, grade
@@ -47,6 +46,7 @@ from naibu.workflows.fields.block_mesh import (
     sizes_of_voxels,
 )
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
+from naibu.workflows.fields.likely_components import require_likely_components
 from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, placed_on_scan, relative_deformation
 from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ObjectOnCubes, ScannedObject, identified_on_smaller_cubes
 from naibu.workflows.fields.thin_coverings import Covering, told_left_out
@@ -59,7 +59,6 @@ if TYPE_CHECKING:
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
 NO_VALUE = np.nan, 0.0, np.inf, np.nan, -1.0, 0.5  # Young's modulus, Poisson's ratio, and their bounds, of a zone that is left out
-BEYOND_KNOWN = 1e4  # times the stiffest, or part of the softest, known Young's modulus
 CELLS_OF_MAP = 2500  # of the model by default, where points are as many: finer cells than these are apart show nothing more
 LEAST_OF_MAP = 700  # cells, since maps of some hundred are searched with the whole Hessian, which takes longer
 POINTS_OF_CELL, LEAST_CELLS = 2, 64  # cells with fewer points leave to the motion of the surface what zones of uniform moduli would tell
@@ -141,6 +140,7 @@ def identify_fields(
     unit: str | None = None,
     spacing_mm: Sequence[float] | None = None,
     node_spacing: Sequence[float] | None = None,
+    check_components: bool = True,
     out: str | os.PathLike[str] | None = None,
     overwrite: bool = False,
     progress: Progress | None = None,
@@ -178,6 +178,8 @@ def identify_fields(
         Unit of fields that do not state theirs, or the size of a voxel along x, y, z, mm, of fields in voxels (see `naibu.io.read_field`).
     node_spacing : sequence of float, optional
         From node to node along x, y, z, in voxels, of TIFF files of SPAM.
+    check_components : bool
+        Whether to refuse fields that would suit an elastic body far better with their components of other signs or in another order.
     out : path-like, optional
         Folder for ``model.json``, which predicts and can be touched; ``young_modulus.mha``, ``young_modulus_sd.mha`` and
         ``poisson_ratio.mha`` on the grid of the mask (0 outside; not a number, NaN, where the value is not determined or not to be used,
@@ -191,7 +193,8 @@ def identify_fields(
     Raises
     ------
     InputError
-        Files that cannot be read or do not fit together, a known zone that does not exist, or nothing that sets the scale.
+        Files that cannot be read or do not fit together, a known zone that does not exist, nothing that sets the scale, or displacements
+        that are likely not in the frame of their positions.
     ConvergenceError
         The fields do not fix how the surface moves, or there is no equilibrium.
     """
@@ -215,7 +218,9 @@ def identify_fields(
         size = element_size_mm or scanned.edge_mm(usual)
     cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
-    bounds = _bounds([young for young, _ in stated.values.values()] or [1.0])
+    if check_components:
+        require_likely_components(scanned, points, progress)
+    bounds = stated.bounds
     if stated is NOTHING_KNOWN:
         found = identify_relative_map(cubes.mesh, cubes.load_cases, law=law, bounds=bounds, progress=progress)
     else:
@@ -261,11 +266,6 @@ def _stated(known: Sequence[str], names: Sequence[str], *, each_cell: bool) -> K
         ways = "; without it a map is made of multiples of the modulus of its largest region" if each_cell else ""
         raise InputError(f"known names every zone, so that nothing is left to be identified: leave one out{ways}")
     return stated
-
-
-def _bounds(known_kpa: Sequence[float]) -> Bounds:
-    """Return bounds of shear moduli, beyond which a zone cannot be told from one that is rigid, or empty."""
-    return Bounds(shear_modulus=(min(known_kpa) / BEYOND_KNOWN, max(known_kpa) * BEYOND_KNOWN))
 
 
 def _require_different(paths: Sequence[str | os.PathLike[str]], fields: Sequence[DisplacementField]) -> None:

@@ -8,10 +8,12 @@ from dataclasses import dataclass
 from naibu.core.errors import InputError
 from naibu.core.units import kilopascals
 from naibu.identification.from_fields.forward.load_cases import POISSON_RATIO, POISSON_RATIO_SD
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 
 RIGID = (
     3e4  # stiffness of what is called rigid over that of the stiffest other known material: with 300 a slender bone bends by a millimetre
 )
+BEYOND_KNOWN = 1e4  # times the stiffest, or part of the softest, known Young's modulus
 LARGEST_POISSON_RATIO = 0.499  # of a known zone: beyond, elements of one pressure each lock
 
 
@@ -27,6 +29,12 @@ class KnownZones:
     def not_rigid(self) -> tuple[str, ...]:
         """Names of the zones that are not called rigid."""
         return tuple(self.doubts)
+
+    @property
+    def bounds(self) -> Bounds:
+        """Bounds of shear moduli, beyond which a zone cannot be told from one that is rigid, or empty."""
+        known = [young for young, _ in self.values.values()] or [1.0]
+        return Bounds(shear_modulus=(min(known) / BEYOND_KNOWN, max(known) * BEYOND_KNOWN))
 
     def without(self, names: Collection[str]) -> KnownZones:
         """Return what is known of other zones than these."""

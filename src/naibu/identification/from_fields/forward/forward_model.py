@@ -116,10 +116,10 @@ class Observed:
         """Positions of the measurements (k, d), mm."""
         return self.load_case.field.points[self.load_case.field.valid]
 
-    def beyond(self, modes: FloatArray) -> FloatArray:
-        """Return what of the data (q,) no combination of displacements (n d, m) of all nodes, mm, explains."""
+    def beyond(self, modes: FloatArray, data: FloatArray) -> FloatArray:
+        """Return what of whitened data (q,) or (q, r) no combination of displacements (n d, m) of all nodes, mm, explains."""
         columns = self.operator @ modes
-        return np.asarray(self.data - columns @ np.linalg.lstsq(columns, self.data, rcond=None)[0])
+        return np.asarray(data - columns @ np.linalg.lstsq(columns, data, rcond=None)[0])
 
     def residual(self, u: FloatArray) -> FloatArray:
         """Return the whitened difference (q,) of a displacement (n, d), mm, from the measurements."""
