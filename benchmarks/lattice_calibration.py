@@ -29,10 +29,11 @@ import numpy as np
 from numpy.typing import NDArray
 from records import ResultTable, write_record
 
+from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.evaluation import residuals_at
 from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD, calibrate_lattice
 from naibu.identification.lattice_calibration.study_model import StudyModel
-from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
+from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import FRICTION, SHIFT, StudyUnknowns
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
 from naibu.workflows.studies.lattice_study import prepared_study

@@ -18,9 +18,10 @@ from notebooks import check_shown
 
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import ProgressReport
+from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.study_model import StudyModel
-from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
+from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
 from naibu.workflows.parallel.task import Task
 from naibu.workflows.studies import calibration_starts

@@ -16,13 +16,14 @@ from .from_markers.known_materials import KnownMaterials
 from .from_markers.observations import NoiseModel
 from .from_markers.specimen.specimen_model import ModelSettings
 from .from_motion.rheology import MotionEstimate, MotionLoadCase, identify_motion
+from .lattice_calibration.captured.recorded_forces import RecordedForces
+from .lattice_calibration.captured.shape_distance import force_difference, shape_difference
 from .lattice_calibration.estimate import LatticeEstimate
 from .lattice_calibration.evolutionary import search_cma_es, search_genetic
 from .lattice_calibration.forward_model import Capture, PushedFace, Pushing
 from .lattice_calibration.gauss_newton import CalibrationProblem, calibrate_lattice
 from .lattice_calibration.report_indices import ReportIndices, indices
-from .lattice_calibration.shape_distance import force_difference, shape_difference
-from .lattice_calibration.study_problem import RecordedForces, StudyProblem
+from .lattice_calibration.study_problem import StudyProblem
 from .lattice_calibration.study_unknowns import StudyUnknowns, Trial
 from .lattice_calibration.unknowns import LatticeUnknowns
 from .material_testing.marker_strain import MarkerStrain, marker_strain, poisson_ratio_from_markers

@@ -11,10 +11,11 @@ from lattice_studies import study_file
 
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
+from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.evaluation import evaluated
 from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD, calibrate_lattice, estimate_at
 from naibu.identification.lattice_calibration.study_model import StudyModel
-from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
+from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, run_study

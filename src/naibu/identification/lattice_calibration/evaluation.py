@@ -82,4 +82,6 @@ def residuals_at(
 def _joined(parts: list[Reproduced], order: IntArray) -> Reproduced:
     back = np.argsort(order)
     positions, forces = (np.concatenate([getattr(p, name) for p in parts])[back] for name in ("positions_change", "force_change"))
-    return replace(parts[0], positions_change=positions, force_change=forces)
+    histories = [p.history for p in parts if p.history is not None]
+    history = replace(histories[0], change=np.concatenate([h.change for h in histories])[back]) if histories else None
+    return replace(parts[0], positions_change=positions, force_change=forces, history=history)

@@ -21,11 +21,11 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.optional_packages import optional_package
 from naibu.core.progress import Progress, report_progress
+from naibu.identification.lattice_calibration.captured.shape_distance import closest_points, force_difference
 from naibu.identification.lattice_calibration.evaluation import evaluated
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S
 from naibu.identification.lattice_calibration.gauss_newton import CalibrationProblem
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
-from naibu.identification.lattice_calibration.shape_distance import closest_points, force_difference
 
 Measure = Literal["chi-squared", "report"]
 WORST = 1e30  # cost of parameters whose motion cannot be computed

@@ -12,7 +12,8 @@ from numpy.typing import ArrayLike
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import InputError
-from naibu.identification.lattice_calibration.shape_distance import checked_points, closest_points
+from naibu.identification.lattice_calibration.captured.force_history import ForceHistory
+from naibu.identification.lattice_calibration.captured.shape_distance import checked_points, closest_points
 from naibu.mechanics.contact.triangle_tree import TriangleTree
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, require_positive
@@ -169,12 +170,15 @@ class Reproduced:
         Derivatives along p directions of the parameters.
     force_change : ndarray, shape (p, samples, indenters, 3)
         Likewise.
+    history : ForceHistory, optional
+        What the forces are means of.
     """
 
     positions: FloatArray
     force: FloatArray
     positions_change: FloatArray
     force_change: FloatArray
+    history: ForceHistory | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

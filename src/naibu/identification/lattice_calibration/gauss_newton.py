@@ -18,10 +18,12 @@ from numpy.typing import ArrayLike
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import Progress
+from naibu.identification.lattice_calibration.captured.shape_distance import closest_points
 from naibu.identification.lattice_calibration.estimate import IMPROVED, LatticeEstimate, estimate_from, interrupted_estimate
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual, evaluated
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
 from naibu.identification.lattice_calibration.intervals.local_regression import LocalRegression
+from naibu.identification.lattice_calibration.intervals.model_errors import with_errors_of_the_model
 from naibu.identification.lattice_calibration.intervals.widened_covariance import widened_covariance
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 from naibu.identification.lattice_calibration.least_squares import (
@@ -36,7 +38,6 @@ from naibu.identification.lattice_calibration.least_squares import (
     unsettled_covariance,
 )
 from naibu.identification.lattice_calibration.secant_search import SecantSearch
-from naibu.identification.lattice_calibration.shape_distance import closest_points
 from naibu.identification.lattice_calibration.simulated_points import SimulatedPoints
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns, identifiability
 from naibu.mechanics.lattices.model.lattice import Lattice
@@ -146,6 +147,10 @@ class CalibrationProblem:
     def enlarged(self, excess: tuple[float, float]) -> CalibrationProblem:
         """Return the problem with other factors of the noise."""
         return replace(self, excess=excess)
+
+    def with_half_steps(self) -> None:
+        """Return None: steps are those of the samples, and virtual captures are made with them."""
+        return
 
     def weighed(
         self, load_case: LatticeLoadCase, found: Reproduced, step: float
@@ -274,7 +279,8 @@ def _searched(
         return replace(estimate_from(here, point, covariance_at(point, prior_sd), count, at.runs), remarks=(IMPROVED,))
     point = replace(point, slopes=at(here, point.theta).slopes)
     widened = widened_covariance(here, point, centre, prior_sd, at)
-    return replace(estimate_from(here, point, widened.covariance, count, at.runs), remarks=widened.remarks(problem.unknowns.names))
+    covariance = with_errors_of_the_model(here, point, widened.covariance, centre, prior_sd, at)
+    return replace(estimate_from(here, point, covariance, count, at.runs), remarks=widened.remarks(problem.unknowns.names))
 
 
 def _in_other_units(point: EvaluatedPoint, old: tuple[float, float], new: tuple[float, float]) -> EvaluatedPoint:

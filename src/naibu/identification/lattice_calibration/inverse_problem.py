@@ -56,5 +56,8 @@ class InverseProblem(Protocol):
     def enlarged(self, excess: tuple[float, float]) -> Any:
         """Return the problem with other factors of the noise."""
 
+    def with_half_steps(self) -> Any | None:
+        """Return the problem with fine steps of half the length, whose residuals tell what steps leave; None where that tells nothing."""
+
     def weighed(self, load_case: Any, found: Any, step: float) -> tuple[tuple[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]:
         """Return residuals (count,) and derivatives (count, p) of points and of forces in units of their noise."""

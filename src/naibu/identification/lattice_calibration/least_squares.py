@@ -15,6 +15,7 @@ from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, 
 from naibu.identification.lattice_calibration.inverse_problem import InverseProblem
 
 LONGEST = 1.0  # change of a logarithm in one iteration
+STRETCHES = 16  # of forces, in which what they lack is alike
 SETTLED = 0.05  # decrease of chi-squared that is not worth another iteration
 
 
@@ -120,6 +121,13 @@ def about(covariance: FloatArray, step: FloatArray, most: FloatArray) -> FloatAr
     factor = np.minimum(np.sqrt(np.diag(most) / np.diag(moments)), 1.0)
     limited = moments * np.outer(factor, factor)
     return np.asarray(0.5 * (limited + limited.T))
+
+
+def in_stretches(force: FloatArray) -> FloatArray:
+    """Return residuals of forces (n,), in the order of time, one stretch of time a row (`STRETCHES`, n), zero elsewhere."""
+    found = np.zeros((STRETCHES, len(force)))
+    found[np.arange(len(force)) * STRETCHES // max(len(force), 1), np.arange(len(force))] = force
+    return found
 
 
 def noise_factors(problem: InverseProblem, residual: Residual) -> tuple[float, float]:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from naibu.identification.lattice_calibration.captured.shape_distance import closest_points, force_difference
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, Reproduced
-from naibu.identification.lattice_calibration.shape_distance import closest_points, force_difference
 from naibu.mechanics.lattices.model.lattice import LatticeParameters
 
 

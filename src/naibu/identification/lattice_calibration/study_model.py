@@ -10,6 +10,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
+from naibu.identification.lattice_calibration.captured.force_history import ForceHistory
 from naibu.identification.lattice_calibration.forward_model import QUICK_S, Reproduced
 from naibu.identification.lattice_calibration.study_unknowns import Trial, TrialChange
 from naibu.mechanics.contact.triangle_tree import TriangleTree
@@ -151,15 +152,17 @@ class StudyModel:
                 return found
         else:
             found, tangents = self._touching(trial), []
-        by_tangent = iter(zip(found.positions_change, found.force_change, strict=True))
+        by_tangent = iter(zip(found.positions_change, found.force_change, found.history.change, strict=True))
         slopes = [next(by_tangent) if tangents and c.tangent is not None else self._difference(found, c) for c in changes]
         if not slopes:
             return found
-        return replace(found, positions_change=np.stack([s[0] for s in slopes]), force_change=np.stack([s[1] for s in slopes]))
+        positions, force, history = (np.stack([s[k] for s in slopes]) for k in range(3))
+        return replace(found, positions_change=positions, force_change=force, history=replace(found.history, change=history))
 
-    def _difference(self, found: Reproduced, change: TrialChange) -> tuple[FloatArray, FloatArray]:
-        moved = self._tied(change.moved, ()) if self.study.tied else self._touching(change.moved)
-        return (moved.positions - found.positions) / np.expm1(change.shift), (moved.force - found.force) / np.expm1(change.shift)
+    def _difference(self, found: Reproduced, change: TrialChange) -> tuple[FloatArray, FloatArray, FloatArray]:
+        moved, by = self._tied(change.moved, ()) if self.study.tied else self._touching(change.moved), np.expm1(change.shift)
+        history = (moved.history.force - found.history.force) / by
+        return (moved.positions - found.positions) / by, (moved.force - found.force) / by, history
 
     def _lattice(self, trial: Trial) -> tuple[Lattice, FloatArray | None]:
         """Return the lattice with a trial's masses, and the external force on it."""
@@ -183,7 +186,7 @@ class StudyModel:
         loads = Loads(np.arange(lattice.n_nodes), share, np.full(lattice.n_nodes, bodies))
         force = np.concatenate([np.zeros((bodies, 3)), total[None]])
         sums, sums_change = np.zeros((self.windows, bodies, 3)), np.zeros((len(changes), self.windows, bodies, 3))
-        kept, kept_change = {0: state.position}, {0: change.position}
+        kept, kept_change, histories = {0: state.position}, {0: change.position}, []
         for s in self.stretches:
             path = np.concatenate([s.velocity, np.zeros((len(s.velocity), 1, 3))], axis=1)
             run = driven_steps(
@@ -192,10 +195,12 @@ class StudyModel:
             state, change = run.state, run.state_change
             kept[s.end], kept_change[s.end] = state.position, change.position
             self._add(s, run.reaction[:, :bodies], sums)
+            histories.append((run.reaction[:, :bodies], run.reaction_change[:, :, :bodies]))
             for own, slope in zip(sums_change, run.reaction_change, strict=True):
                 self._add(s, slope[:, :bodies], own)
         shape_change = np.stack([kept_change[c] for c in self.captures], axis=1) if self.captures else np.zeros((len(changes), 0, 0, 3))
-        return Reproduced(self._shapes(kept), sums, shape_change, sums_change)
+        history = self._history([h[0] for h in histories], np.concatenate([h[1] for h in histories], axis=1))
+        return Reproduced(self._shapes(kept), sums, shape_change, sums_change, history)
 
     def _touching(self, trial: Trial) -> Reproduced:
         study = self.study
@@ -205,13 +210,20 @@ class StudyModel:
             for e in self._lengths()
         }
         state = next(iter(engines.values())).rest()
-        sums, kept = np.zeros((self.windows, len(study.bodies), 3)), {0: state.position}
+        sums, kept, reactions = np.zeros((self.windows, len(study.bodies), 3)), {0: state.position}, []
         for s in self.stretches:
             motion = push(engines[s.each], state, trial.indenters, s.velocity, external_force=external)
             state = motion.state
             kept[s.end] = state.position
+            reactions.append(motion.reaction)
             self._add(s, motion.reaction, sums)
-        return Reproduced(self._shapes(kept), sums, np.zeros((0, len(self.captures), 0, 3)), np.zeros((0, *sums.shape)))
+        none = np.zeros((0, *sums.shape))
+        history = self._history(reactions, np.zeros((0, sum(map(len, reactions)), *none.shape[2:])))
+        return Reproduced(self._shapes(kept), sums, np.zeros((0, len(self.captures), 0, 3)), none, history)
+
+    def _history(self, reactions: Sequence[FloatArray], change: FloatArray) -> ForceHistory:
+        borders = np.concatenate([[0], *(np.arange(s.begin, s.end, s.each) + s.each for s in self.stretches)])
+        return ForceHistory(self.study.step_s * borders, np.concatenate(reactions), change)
 
     def _lengths(self) -> list[int]:
         return sorted({s.each for s in self.stretches})

@@ -9,113 +9,17 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
+from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
+from naibu.identification.lattice_calibration.captured.sensor_errors import NO_ERRORS, BodyResiduals, SensorErrors, body_residuals
+from naibu.identification.lattice_calibration.captured.shape_distance import checked_points, closest_points
 from naibu.identification.lattice_calibration.forward_model import Reproduced
-from naibu.identification.lattice_calibration.shape_distance import checked_points, closest_points
 from naibu.identification.lattice_calibration.study_model import StudyModel
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
 from naibu.mechanics.lattices.model.lattice import require_positive
 from naibu.mechanics.lattices.model.surface import surface_of
-from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
 
-WINDOW_S = 0.02
 ROUGHNESS = 2e-5  # of chi-squared in contact
-LEAST_WITHIN = 0.02  # of the samples of a record within the study: with fewer, times are likely to have another unit
 FEW, TIMES_OFF = 10, 30.0  # points that tell an extent, and by how many times it may differ from that of the object
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class RecordedForces:
-    """Mean forces of windows.
-
-    Attributes
-    ----------
-    window_steps : int
-        Steps of the study in a window.
-    force : ndarray, shape (windows, bodies, 3)
-        mN; NaN where nothing was recorded.
-    samples : ndarray, shape (windows, bodies)
-        Number of samples that were averaged.
-    shares : ndarray, shape (windows * window_steps, bodies)
-        Of the steps in the means of their windows, by the samples that were taken in them: simulated forces are averaged alike.
-    sd_mn : ndarray, shape (bodies,)
-        Standard deviation of a component in one sample.
-    """
-
-    window_steps: int
-    force: FloatArray
-    samples: FloatArray
-    shares: FloatArray
-    sd_mn: FloatArray
-
-    @classmethod
-    def of(
-        cls,
-        study: LatticeStudy,
-        records: Sequence[tuple[int, FloatArray, FloatArray]],
-        *,
-        sd_mn: float | None = None,
-        window_s: float = WINDOW_S,
-    ) -> RecordedForces:
-        """Average samples over windows of time, the same for all records.
-
-        Windows last at least `window_s` and are so long that, at the mean rate of the slowest record, each holds a sample. Windows
-        without a sample do not count. No sample is interpolated.
-
-        Parameters
-        ----------
-        study : LatticeStudy
-            Gives steps and duration.
-        records : sequence of (int, ndarray, ndarray)
-            Number of a body, times (n,), s, and forces (n, 3), mN, on the object.
-        sd_mn : float
-            Standard deviation of a component of a sample, mN; by default estimated from second differences of neighbouring samples.
-        window_s : float
-            s.
-
-        Raises
-        ------
-        InputError
-            No sample during the study, or a standard deviation that is not positive or cannot be estimated.
-        """
-        if sd_mn is not None:
-            require_positive(sd_mn, "force_sd_mn", "mN")
-        slowest = max((float(np.median(np.diff(times))) for _, times, _ in records), default=0.0)
-        each = max(1, round(window_s / study.step_s), int(np.ceil(1.0001 * slowest / study.step_s)))
-        end = round(study.frames * study.frame_s / study.step_s)
-        windows, bodies = end // each, len(study.bodies)
-        if windows == 0:
-            raise InputError(
-                f"samples of the forces are {slowest:g} s apart, and the study lasts {end * study.step_s:g} s: no window holds one; "
-                "is the unit of times another one, to be named in the column, as in time_ms?"
-            )
-        shares = np.full((windows * each, bodies), 1.0 / each)
-        sums, samples, sd = np.zeros((windows, bodies, 3)), np.zeros((windows, bodies)), np.full(bodies, np.nan)
-        for body, times, force in records:
-            place = np.floor(times / (each * study.step_s) - 1e-9).astype(np.int64)
-            inside = (times > 0.0) & (place < windows)
-            if inside.mean() < LEAST_WITHIN:
-                raise InputError(
-                    f"the record of {study.bodies[body].name} lasts from {times[0]:g} to {times[-1]:g} s, the study from 0 to "
-                    f"{end * study.step_s:g} s: {inside.sum() or 'no'} of {len(times)} samples lie within; give times from the beginning "
-                    "of the motion on, their unit in the name of the column, as in time_ms, and not what was recorded long before or after"
-                )
-            np.add.at(sums[:, body], place[inside], force[inside])
-            np.add.at(samples[:, body], place[inside], 1.0)
-            count = np.bincount(np.floor(times[inside] / study.step_s - 1e-9).astype(np.int64), minlength=windows * each)
-            shares[:, body] = count / np.maximum(np.repeat(samples[:, body], each), 1.0)
-            sd[body] = sd_mn if sd_mn is not None else _noise(study.bodies[body].name, force)
-        last = int(np.flatnonzero(samples.any(axis=1))[-1]) + 1 if records else 0
-        mean = np.where(samples[:last, :, None] > 0.0, sums[:last] / np.maximum(samples[:last, :, None], 1.0), np.nan)
-        return cls(each, mean, samples[:last], shares[: last * each], sd)
-
-
-def _noise(name: str, force: FloatArray) -> float:
-    """Return the standard deviation of samples (n, 3) from their second differences, robustly."""
-    second = force[2:] - 2.0 * force[1:-1] + force[:-2]
-    sd = float(np.median(np.abs(second)) / 0.6745 / np.sqrt(6.0)) if len(second) else 0.0
-    if not sd > 0.0:
-        raise InputError(f"the noise of the record of {name} cannot be told from its {len(force)} samples; give force_sd_mn")
-    return sd
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,12 +56,15 @@ class StudyProblem:
         Standard deviation of the coordinates of captured points.
     excess : tuple of float
         Factors of the noise of points and forces, for laws that do not fit to within it.
+    sensor_errors : SensorErrors
+        That force sensors may have; what they explain is no residual.
     """
 
     unknowns: StudyUnknowns
     load_cases: tuple[StudyLoadCase, ...]
     point_sd_mm: float
     excess: tuple[float, float] = (1.0, 1.0)
+    sensor_errors: SensorErrors = NO_ERRORS
 
     @classmethod
     def of(
@@ -167,6 +74,7 @@ class StudyProblem:
         forces: RecordedForces,
         *,
         point_sd_mm: float,
+        sensor_errors: SensorErrors = NO_ERRORS,
     ) -> StudyProblem:
         """Set up the calibration of the study of the unknowns.
 
@@ -180,6 +88,8 @@ class StudyProblem:
             What the sensors recorded.
         point_sd_mm : float
             Standard deviation of a coordinate.
+        sensor_errors : SensorErrors
+            That the sensors may have, to be estimated along.
 
         Raises
         ------
@@ -205,7 +115,7 @@ class StudyProblem:
             clouds.append(cloud)
         times, windows = [time for time, _ in captures], len(forces.force)
         coarse, fine = (StudyModel.of(study, times, windows, forces.window_steps, coarse=c, shares=forces.shares) for c in (True, False))
-        return cls(unknowns, (StudyLoadCase(tuple(clouds), forces, coarse, fine),), point_sd_mm)
+        return cls(unknowns, (StudyLoadCase(tuple(clouds), forces, coarse, fine),), point_sd_mm, sensor_errors=sensor_errors)
 
     @property
     def roughness(self) -> float:
@@ -219,6 +129,20 @@ class StudyProblem:
     def enlarged(self, excess: tuple[float, float]) -> StudyProblem:
         """Return the problem with other factors of the noise."""
         return replace(self, excess=excess)
+
+    def with_half_steps(self) -> StudyProblem | None:
+        """Return the problem with fine steps of half the length; None in contact, where jumps count more than what steps leave."""
+        if not self.unknowns.study.tied:
+            return None
+        study = self.unknowns.study
+        shorter = replace(study, step_s=0.5 * study.step_s, sample_steps=2 * study.sample_steps)
+        cases = []
+        for case in self.load_cases:
+            forces = case.forces.with_half_steps()
+            times = [study.step_s * step for step in case.fine.captures]
+            fine = StudyModel.of(shorter, times, len(forces.force), forces.window_steps, coarse=False, shares=forces.shares)
+            cases.append(replace(case, forces=forces, fine=fine))
+        return replace(self, unknowns=replace(self.unknowns, study=shorter), load_cases=tuple(cases))
 
     def weighed(
         self, load_case: StudyLoadCase, found: Reproduced, step: float
@@ -239,10 +163,19 @@ class StudyProblem:
 
     def _force_rows(self, forces: RecordedForces, found: Reproduced, p: int) -> tuple[FloatArray, FloatArray]:
         counted = np.isfinite(forces.force)
-        sd = self.excess[1] * forces.sd_mn / np.sqrt(np.maximum(forces.samples, 1.0))
-        each = np.broadcast_to(sd[:, :, None], counted.shape)[counted]
-        slopes = np.stack([change[counted] for change in found.force_change], axis=1) if p else np.zeros((int(counted.sum()), 0))
-        return (found.force[counted] - forces.force[counted]) / each, slopes / each[:, None]
+        residual, slopes = np.zeros(counted.shape), np.zeros((p, *counted.shape))
+        for body, own in self.of_bodies(forces, found).items():
+            residual[own.counted, body], slopes[:, own.counted, body] = own.residual, own.slopes
+        return residual[counted], slopes[:, counted].T
+
+    def of_bodies(self, forces: RecordedForces, found: Reproduced) -> dict[int, BodyResiduals]:
+        """Return the residuals of every body that has a record, with what errors of its sensor explain."""
+        errors, step_s, excess = self.sensor_errors, self.unknowns.study.step_s, self.excess[1]
+        recorded = np.flatnonzero(np.isfinite(forces.force).any(axis=(0, 2)))
+        return {
+            body: body_residuals(errors, forces, body, step_s, found.force[:, body], found.force_change[:, :, body], found.history, excess)
+            for body in recorded.tolist()
+        }
 
 
 def _check_size(time: float, cloud: FloatArray, reach: float) -> None:

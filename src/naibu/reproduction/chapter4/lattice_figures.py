@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
+from naibu.identification.lattice_calibration.captured.shape_distance import closest_points
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, Reproduced
-from naibu.identification.lattice_calibration.shape_distance import closest_points
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

@@ -18,8 +18,9 @@ from naibu._version import __version__
 from naibu.core.arrays import require_within
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
+from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
-from naibu.identification.lattice_calibration.study_problem import RecordedForces, StudyProblem
+from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import PULL_OFF, Friction, Groups, StudyUnknowns
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.provenance import sha256

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from naibu.core.arrays import FloatArray
+from naibu.identification.lattice_calibration.captured.shape_distance import closest_points
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
-from naibu.identification.lattice_calibration.shape_distance import closest_points
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.io.tables.force_records import ForceRecord
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section

@@ -23,7 +23,7 @@ from scipy.ndimage import uniform_filter1d
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint
-from naibu.identification.lattice_calibration.least_squares import about, unsettled_covariance
+from naibu.identification.lattice_calibration.least_squares import STRETCHES, about, in_stretches, unsettled_covariance
 from naibu.identification.lattice_calibration.simulated_points import FARTHEST, SimulatedPoints
 
 NARROWEST = 0.004  # standard deviation of relative changes of the values around the estimate, along principal axes
@@ -42,7 +42,6 @@ LONGEST = 0.4  # relative change of a value in a round
 CLOSE = 2.0  # standard deviations: a step within them ends the rounds
 FINE = 3  # points with fine steps
 MISFIT = 1.2  # mean square of residuals in units of noise and error of the model, from which both are taken as larger
-STRETCHES = 16  # of forces, in which what they lack is alike
 NEIGHBOURS = (101, 15)  # of points and of forces, whose errors of the model are averaged
 
 
@@ -197,8 +196,7 @@ def _lacking(level: FloatArray, noise: FloatArray, points: int) -> FloatArray:
     independent instead (after :cite:t:`newey1987`).
     """
     count = len(level) - points
-    found = np.zeros((STRETCHES, len(level)))
-    found[np.arange(count) * STRETCHES // max(count, 1), points + np.arange(count)] = level[points:]
+    found = np.hstack([np.zeros((STRETCHES, points)), in_stretches(level[points:])])
     return found if count and noise[-1] > 1.0 else found[:0]
 
 

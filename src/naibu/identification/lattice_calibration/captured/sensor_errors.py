@@ -1,0 +1,168 @@
+"""Errors of force sensors, estimated along with the parameters: an offset and a drift of each component, and a clock that is late.
+
+They enter the residuals linearly, or one by one, so that they need no place in the search: at any parameters the best of them are found,
+and what is left are residuals of the parameters alone (variable projection; :cite:t:`golub1973`). Derivatives are taken without what the
+errors may explain, so that intervals hold whatever they are. What shifts the forces in time is told from their changes, an offset from how
+what they lack stays the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.optimize
+
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.identification.lattice_calibration.captured.force_history import DelayedMeans, ForceHistory
+from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
+
+MOST_DELAY_S = 0.2  # either way
+DELAY_SD_S = 0.2  # weak prior, where forces hardly change
+EXACT_S = 1e-7
+
+
+@dataclass(frozen=True, slots=True)
+class SensorErrors:
+    """Which errors the sensors may have.
+
+    Attributes
+    ----------
+    offset : bool
+        A constant of each component: the sensor was not tared.
+    drift : bool
+        A constant and what grows evenly with time, of each component.
+    delay : bool
+        The clock of each record is late or early, by up to `MOST_DELAY_S`.
+    """
+
+    offset: bool = False
+    drift: bool = False
+    delay: bool = False
+
+    @property
+    def any(self) -> bool:
+        """Whether there is one."""
+        return self.offset or self.drift or self.delay
+
+    @property
+    def steady(self) -> int:
+        """How many functions of time each component may be off by."""
+        return 2 if self.drift else int(self.offset)
+
+
+NO_ERRORS = SensorErrors()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BodyResiduals:
+    """Forces of one body against its record, in units of their noise, without what errors of the sensor explain.
+
+    Attributes
+    ----------
+    counted : ndarray, shape (windows,), bool
+        Windows with samples.
+    residual, slopes : ndarray, shape (n, 3), (p, n, 3)
+        Of the counted windows.
+    explained : ndarray, shape (k, 3)
+        Offset, mN, and what is added every second, mN/s, of each component; as many as were sought.
+    explained_slopes : ndarray, shape (p, k, 3)
+        How they change with the parameters.
+    explained_variance : ndarray, shape (k,)
+        Of each component, at known parameters.
+    delay : float
+        s; 0 where none was sought.
+    delay_slopes : ndarray, shape (p,)
+        How it changes with the parameters.
+    delay_variance : float
+        At known parameters.
+    """
+
+    counted: BoolArray
+    residual: FloatArray
+    slopes: FloatArray
+    explained: FloatArray
+    explained_slopes: FloatArray
+    explained_variance: FloatArray
+    delay: float
+    delay_slopes: FloatArray
+    delay_variance: float
+
+
+def body_residuals(
+    errors: SensorErrors,
+    record: RecordedForces,
+    body: int,
+    step_s: float,
+    means: FloatArray,
+    means_change: FloatArray,
+    history: ForceHistory | None,
+    excess: float = 1.0,
+) -> BodyResiduals:
+    """Return residuals of one body.
+
+    Parameters
+    ----------
+    errors : SensorErrors
+        That the sensor may have.
+    record : RecordedForces
+        What was measured.
+    body : int
+        Its number; it has a record.
+    step_s : float
+        Fine step, s.
+    means, means_change : ndarray, shape (windows, 3), (p, windows, 3)
+        Simulated means over the windows and their derivatives, mN.
+    history : ForceHistory, optional
+        What they are means of; needed for a delay.
+    excess : float
+        Factor of the noise.
+    """
+    seen = record.force[:, body]
+    counted = np.isfinite(seen).all(axis=1)
+    weight = np.sqrt(record.samples[counted, body])[:, None] / (excess * record.sd_mn[body])
+    middle = record.window_steps * step_s * (np.flatnonzero(counted) + 0.5)
+    design = np.power.outer(middle - middle.mean(), np.arange(errors.steady))
+    basis, upper = np.linalg.qr(weight * design)
+
+    def without(rows: FloatArray) -> FloatArray:
+        return rows - basis @ (basis.T @ rows)
+
+    delay, rate = 0.0, np.zeros_like(seen)
+    if errors.delay and history is not None:
+        shares = record.shares[:, body]
+        of_body = DelayedMeans.of(history.borders, history.force[:, body], shares, record.window_steps, step_s)
+        delay = _best_delay(lambda tau: float((without(weight * (of_body(tau)[0] - seen)[counted]) ** 2).sum()))
+        means, rate = of_body(delay)
+        p, n = len(history.change), len(history.force)
+        if p:
+            flat = history.change[:, :, body].transpose(1, 0, 2).reshape(n, 3 * p)
+            moved = DelayedMeans.of(history.borders, flat, shares, record.window_steps, step_s)(delay)[0]
+            means_change = moved.reshape(-1, p, 3).transpose(1, 0, 2)
+    raw, raw_slopes = weight * (means - seen)[counted], weight * means_change[:, counted]
+    residual, slopes = without(raw), raw_slopes - basis @ (basis.T @ raw_slopes)
+    along, stiffness = without(weight * rate[counted]), DELAY_SD_S**-2
+    variance = 1.0 / (float((along**2).sum()) + stiffness)
+    delay_slopes = -variance * np.tensordot(slopes, along, axes=([1, 2], [0, 1]))
+    slopes = slopes + delay_slopes[:, None, None] * along
+    back = np.linalg.inv(upper)
+    of_delay = back @ basis.T @ (weight * rate[counted])
+    explained_slopes = -(back @ basis.T @ raw_slopes) - delay_slopes[:, None, None] * of_delay
+    spread = (back @ back.T).diagonal() + variance * (of_delay**2).max(axis=1, initial=0.0) * float(errors.delay)
+    return BodyResiduals(
+        counted, residual, slopes, -(back @ basis.T @ raw), explained_slopes, spread, delay, delay_slopes, variance if errors.delay else 0.0
+    )  # fmt: skip
+
+
+def _best_delay(cost: Callable[[float], float]) -> float:
+    """Return the delay, s, of the least cost with that of the weak prior."""
+
+    def whole(delay: float) -> float:
+        return cost(delay) + (delay / DELAY_SD_S) ** 2
+
+    grid = np.linspace(-MOST_DELAY_S, MOST_DELAY_S, 41)
+    place = int(np.argmin([whole(delay) for delay in grid]))
+    low, high = grid[max(place - 1, 0)], grid[min(place + 1, len(grid) - 1)]
+    found = scipy.optimize.minimize_scalar(whole, bounds=(low, high), method="bounded", options={"xatol": EXACT_S})
+    return float(found.x)
