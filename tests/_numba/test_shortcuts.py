@@ -11,9 +11,11 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from numba.core import event, ir, postproc, targetconfig
+from numba.core import base, event, ir, postproc, targetconfig
 from numba.core.errors import TypingError
 from numba.core.types import functions
+from numba.core.typing import context
+from numba.extending import overload
 
 from naibu._numba import shortcuts
 from naibu._numba.cache_folder import VARIABLE
@@ -81,7 +83,8 @@ def places() -> list[object]:
     """What shortcuts take the place of, as it is now."""
     config = targetconfig.TargetConfig
     found = [event.install_timer, config.values, config.__hash__, config.__eq__]
-    return [*found, ir.Inst._rec_list_vars, functions.BaseFunction.get_call_type, postproc.PostProcessor.run]
+    found += [ir.Inst._rec_list_vars, functions.BaseFunction.get_call_type, postproc.PostProcessor.run]
+    return [*found, base.BaseContext.refresh, context.BaseContext.refresh, base.BaseContext.get_abi_sizeof]
 
 
 def test_nothing_stays() -> None:
@@ -109,6 +112,21 @@ def test_operators_follow_the_options_of_each_kernel() -> None:
         assert numpy(1.0, 0.0) == np.inf
         with pytest.raises(ZeroDivisionError):
             python(1.0, 0.0)
+
+
+def test_what_is_registered_while_a_kernel_is_compiled_is_known_to_the_next() -> None:
+    def named() -> float:
+        raise NotImplementedError
+
+    def kernel() -> float:
+        return named()
+
+    with shortcuts.taken():
+        assert numba.njit(lambda: 1.0)() == 1.0
+        with pytest.raises(TypingError):
+            numba.njit(kernel)()
+        overload(named)(lambda: lambda: 7.0)
+        assert numba.njit(kernel)() == 7.0
 
 
 def test_generators_and_parts_for_the_interpreter_know_what_is_alive() -> None:

@@ -8,7 +8,9 @@ They take the place of functions of Numba while a kernel of naibu is compiled (`
 - options of a compilation are compared as they were set, not option by option through a property each;
 - variables of a statement are listed by what is known of the types of its parts;
 - how an operator acts on numbers is found once, not for each place where it stands: some twenty templates are tried each time;
-- which variables are alive at each block's begin is found for those who ask, which are generators and compilations for the interpreter.
+- which variables are alive at each block's begin is found for those who ask, which are generators and compilations for the interpreter;
+- what was registered with Numba is gone through again when there is more of it, not once more for each kernel that is called;
+- the size of a plain type is asked of LLVM once.
 """
 
 from __future__ import annotations
@@ -17,11 +19,15 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from numba.core import analysis, event, ir, postproc, targetconfig, transforms, types
+from numba.core import analysis, base, event, ir, postproc, targetconfig, transforms, types
 from numba.core.types import functions
+from numba.core.typing import context as typing_context
 
 _find_call_type: Any = functions.BaseFunction.get_call_type
 _process: Any = postproc.PostProcessor.run
+_refresh: Any = base.BaseContext.refresh
+_refresh_typing: Any = typing_context.BaseContext.refresh
+_find_size: Any = base.BaseContext.get_abi_sizeof
 _hash_of_names: Any = targetconfig.TargetConfig.__hash__  # the same for all configurations of a class
 _NUMBERS = (types.Integer, types.Float, types.Boolean, types.IntegerLiteral, types.BooleanLiteral)
 
@@ -31,6 +37,9 @@ _adders: dict[type, Callable[[Any, list[Any]], object]] = {}
 _numbers: dict[Any, bool] = {}
 # what acts on numbers, by the identities of function and context, which are kept with it, and types
 _found: dict[tuple[int, int, tuple[Any, ...]], tuple[Any, Any, Any]] = {}
+# how much was registered with a context when it was refreshed, by its identity; it is kept with it, as the layout of data is
+_registered: dict[int, tuple[Any, int]] = {}
+_sizes: dict[tuple[int, str], tuple[Any, int]] = {}
 
 
 @contextlib.contextmanager
@@ -56,6 +65,9 @@ def _substitutes(config: Any) -> tuple[tuple[Any, str, Any], ...]:
         (ir.Inst, "_rec_list_vars", _variables),
         (functions.BaseFunction, "get_call_type", _call_type),
         (postproc.PostProcessor, "run", _processed),
+        (base.BaseContext, "refresh", _refreshed),
+        (typing_context.BaseContext, "refresh", _refreshed_typing),
+        (base.BaseContext, "get_abi_sizeof", _size),
     )
 
 
@@ -167,3 +179,38 @@ def _processed(self: Any, emit_dels: bool = False, extend_lifetimes: bool = Fals
     code.generator_info = None
     if emit_dels:
         self._insert_var_dels(extend_lifetimes=extend_lifetimes)
+
+
+def _how_many(context: Any) -> int:
+    """Return how much was registered with a context; nothing is ever taken away."""
+    return sum(len(getattr(registry, name)) for registry, loader in context._registries.items() for name in loader.registry_items)
+
+
+def _is_fresh(context: Any) -> bool:
+    known = _registered.get(id(context))
+    return known is not None and known[1] == _how_many(context)
+
+
+def _refreshed(self: Any) -> None:
+    if _is_fresh(self):
+        self.typing_context.refresh()
+        return
+    _refresh(self)
+    _registered[id(self)] = self, _how_many(self)
+
+
+def _refreshed_typing(self: Any) -> None:
+    if not _is_fresh(self):
+        _refresh_typing(self)
+        _registered[id(self)] = self, _how_many(self)
+
+
+def _size(self: Any, kind: Any) -> int:
+    text = str(kind)
+    if "%" in text:  # types with names may mean something else elsewhere
+        return int(_find_size(self, kind))
+    layout = self.target_data
+    known = _sizes.get((id(layout), text))
+    if known is None:
+        known = _sizes[id(layout), text] = layout, _find_size(self, kind)
+    return known[1]
