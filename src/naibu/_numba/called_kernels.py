@@ -18,6 +18,8 @@ from numba.core import sigutils
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler_lock import global_compiler_lock
 
+from naibu._numba import shortcuts
+
 Compiler = Callable[[Any, Any], Any]
 
 
@@ -121,9 +123,10 @@ def compiled_for(called: bool, kernel: Any, compile: Compiler, args: Any, return
     """
     compiler = kernel._compiler
     compiler._customize_flags = _without_wrappers if called else _without_wrapper_for_c
+    faster = contextlib.nullcontext() if being_called() else shortcuts.taken()
     _Nesting.depth += 1
     try:
-        with libraries(CalledLibrary if called else _LibrariesOf(kernel)), _uncollected():
+        with libraries(CalledLibrary if called else _LibrariesOf(kernel)), _uncollected(), faster:
             result = compile(args, return_type)
     finally:
         _Nesting.depth -= 1

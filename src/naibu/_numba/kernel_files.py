@@ -90,7 +90,8 @@ class KernelFile:
 
 def packed(result: Any) -> bytes:
     """Return a compiled kernel as bytes."""
-    data: bytes = serialize.dumps(result._reduce())  # type: ignore[no-untyped-call]
+    # the types of all variables as text are for readers
+    data: bytes = serialize.dumps(result._replace(type_annotation="")._reduce())  # type: ignore[no-untyped-call]
     return data
 
 

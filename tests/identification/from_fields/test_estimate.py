@@ -207,7 +207,7 @@ def region_errors(law: str, draws: int) -> tuple[np.ndarray, np.ndarray]:
     return np.sqrt(np.mean(np.square(errors), axis=0)), bound.standard_deviations()
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", [pytest.param(law, marks=[pytest.mark.slow] * (law == "linear")) for law in LAWS])
 def test_errors_are_those_of_the_cramer_rao_bound(law: str) -> None:
     """Root mean squares of 40 draws scatter by 11 %."""
     rms, bound = region_errors(law, 40)

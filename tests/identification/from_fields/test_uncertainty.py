@@ -153,7 +153,15 @@ def test_at_a_bound_the_interval_is_open(bounds: Bounds) -> None:
         assert young[0][0] < min(5.0, low) and young[0][1] > max(5.0, high)
 
 
-@pytest.mark.parametrize(("poisson_ratio", "cells", "seed"), [(n, c, s) for n in (0.49, 0.499) for c in (4, 6, 9) for s in (0, 1)])
+@pytest.mark.parametrize(
+    ("poisson_ratio", "cells", "seed"),
+    [
+        pytest.param(n, c, s, marks=[pytest.mark.slow] * (c == 9 and s == 1))  # nine cells with one seed are enough
+        for n in (0.49, 0.499)
+        for c in (4, 6, 9)
+        for s in (0, 1)
+    ],
+)
 def test_intervals_hold_poisson_ratios_near_one_half(poisson_ratio: float, cells: int, seed: int) -> None:
     """Elements add .045 to mu / kappa on four cells a side, whose truth is .020 and .002: what is left after extrapolation is in doubt."""
     points, u = nearly_incompressible(poisson_ratio).at(np.random.default_rng(seed).uniform(0.02, 0.98, (400, 3)))

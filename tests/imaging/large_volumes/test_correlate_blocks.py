@@ -133,7 +133,7 @@ def test_standard_deviations_cover_the_truth() -> None:
     assert (distance < 7.815).mean() > 0.9
 
 
-@pytest.mark.parametrize("factor", [2, 4])
+@pytest.mark.parametrize("factor", [pytest.param(2, marks=pytest.mark.slow), 4])
 def test_stated_errors_are_those_of_all_voxels_however_coarse_the_start_is(factor: int) -> None:
     """Residuals of the coarse volumes, whose texture is lost, once made them fourteen times as large, and those of points too small."""
     a, b, truth = scans()

@@ -38,7 +38,7 @@ def test_where_there_is_no_texture_the_gain_stays_that_of_all_voxels() -> None:
     assert np.abs(local_gain(0.02, 0.8, texture) - 0.8).max() < 0.2
 
 
-@pytest.mark.parametrize("seed", [2, 3])
+@pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_body_that_does_not_move_does_not_swell_by_noise(seed: int) -> None:
     """A gain that noise has lowered leaves part of the surface's contrast, which pulls outward: the body swelled by .9 %."""
     body = swollen_body((), seed=seed, noise=20.0, shift_mm=(0.0, 0.0, 0.0))

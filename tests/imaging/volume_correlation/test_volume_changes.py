@@ -55,7 +55,7 @@ def mean_ratio(body: SwollenBody, found: CorrelationResult, where: Array) -> flo
     return float(np.linalg.det(np.eye(3) + found.gradient()[where & found.valid & body.mask]).mean())
 
 
-@pytest.mark.parametrize("ratio", [1.15, 0.85])
+@pytest.mark.parametrize("ratio", [1.15, pytest.param(0.85, marks=pytest.mark.slow)])
 def test_a_part_that_swells_or_shrinks_is_seen_to(ratio: float) -> None:
     """With one weight for the whole body its volume changed by 1 %, and the regions held less than 1 % of the part."""
     part = SwollenSphere(*LARGE, ratio)

@@ -313,7 +313,8 @@ LEVEL = (0.5, 0.0, 4)
     ("cut", "ratio", "within"),
     [
         (LEVEL, 0.3, 0.02), (LEVEL, 0.49, 0.01), (LEVEL, 0.499, 0.01),
-        (OBLIQUE[0], 0.49, 0.03), (OBLIQUE[0], 0.499, 0.09), (OBLIQUE[1], 0.49, 0.02), (OBLIQUE[1], 0.499, 0.04), (OBLIQUE[2], 0.499, 0.02),
+        (OBLIQUE[0], 0.49, 0.03), pytest.param(OBLIQUE[0], 0.499, 0.09, marks=pytest.mark.slow),
+        (OBLIQUE[1], 0.49, 0.02), (OBLIQUE[1], 0.499, 0.04), pytest.param(OBLIQUE[2], 0.499, 0.02, marks=pytest.mark.slow),
     ],
 )  # fmt: skip
 def test_between_walls_a_cut_block_resists_in_time_steps_as_the_whole_one_does(cut, ratio, within):

@@ -146,7 +146,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", list(CASES))
+@pytest.mark.parametrize("case", [pytest.param(k, marks=[pytest.mark.slow] * (k == "plate")) for k in CASES])  # the same plate slides
 def test_every_direction_against_finite_differences(case):
     surface, mu, joined = CASES[case]
     body = pressed(surface, mu, joined=joined)

@@ -89,7 +89,14 @@ def test_a_rod_that_is_led_around_points_to_the_centre_and_its_force_is_decoded(
 
 
 @pytest.mark.parametrize(
-    ("tilt", "azimuth", "way"), [(18.0, 250.0, 0.0), (18.0, 250.0, 1.0), (25.0, 120.0, -1.0), (8.0, 30.0, 1.2), (12.0, 200.0, 0.6)]
+    ("tilt", "azimuth", "way"),
+    [
+        (18.0, 250.0, 0.0),
+        (18.0, 250.0, 1.0),
+        (25.0, 120.0, -1.0),
+        pytest.param(8.0, 30.0, 1.2, marks=pytest.mark.slow),
+        pytest.param(12.0, 200.0, 0.6, marks=pytest.mark.slow),
+    ],
 )
 def test_intervals_hold_the_force_while_the_rod_moves_and_drags(fingertip: TouchableModel, tilt: float, azimuth: float, way: float) -> None:
     """The truth is the rod's own force; it is pressed by 2 mm/s, which the filter follows late, then dragged by `way` at 1 mm/s."""

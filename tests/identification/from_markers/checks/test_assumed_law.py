@@ -73,7 +73,7 @@ def test_where_markers_cannot_tell_the_interval_holds_any_law() -> None:
     assert held(c)[0]
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_a_neo_hookean_gel_is_not_doubted(seed: int) -> None:
     c = found(0.25, 0.1, 0.0, seed)
     assert not any("law does not fit" in reason for reason in verdict_of(c).reasons)

@@ -19,7 +19,7 @@ def test_right_heights_are_not_doubted() -> None:
     assert verdict_of(identified(10.0)).explanation is Explanation.EXPLAINED
 
 
-@pytest.mark.parametrize(("stated", "least", "most"), [(20.0, 22.0, 33.0), (38.0, 27.0, 33.0)])
+@pytest.mark.parametrize(("stated", "least", "most"), [pytest.param(20.0, 22.0, 33.0, marks=pytest.mark.slow), (38.0, 27.0, 33.0)])
 def test_wrong_heights_are_told_with_what_the_markers_say(stated: float, least: float, most: float) -> None:
     found = identified(10.0, stated_mm=stated)
     (doubt,) = contradicted_layers(found)
