@@ -10,6 +10,7 @@ from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, Int8Array
 from naibu.imaging.large_volumes.block_frame import BlockFrame
+from naibu.imaging.preprocessing.morphology import closed_by_steps, dilated
 from naibu.imaging.preprocessing.object_mask import CLOSING, SMOOTHING
 
 BAND = 2  # coarse voxels to both sides of the coarse outline, in which the fine one lies
@@ -74,6 +75,5 @@ def _outlined(frame: BlockFrame, zone: Int8Array, first: Sequence[int], values: 
     kept = np.zeros(n + 1, dtype=bool)
     kept[labels[frame.mask[frame.coarse(first, [a + m for a, m in zip(first, zone.shape, strict=True)])]]] = True
     kept[0] = False
-    pad = CLOSING + 1
-    closed = ndimage.binary_closing(np.pad(kept[labels], pad, mode="edge"), iterations=CLOSING)[(slice(pad, -pad),) * 3]
-    return np.asarray(ndimage.binary_dilation(closed, iterations=MARGIN))
+    closed = closed_by_steps(np.pad(kept[labels], CLOSING, mode="edge"), CLOSING)[(slice(CLOSING, -CLOSING),) * 3]
+    return dilated(closed, MARGIN)

@@ -18,6 +18,7 @@ from naibu.imaging.large_volumes.block_sums import CLASSES, ComparedBlock, Field
 from naibu.imaging.large_volumes.fine_outline import BAND
 from naibu.imaging.large_volumes.noise_tiles import NoiseTiles
 from naibu.imaging.preprocessing.field_of_view import Box
+from naibu.imaging.preprocessing.morphology import dilated
 from naibu.imaging.preprocessing.object_mask import object_threshold
 from naibu.imaging.volume_correlation.common_content import content_of, require_convergence, require_overlap
 from naibu.imaging.volume_correlation.correlate import (
@@ -125,7 +126,7 @@ class SummedEquations:
         object_ = coarse.mask if coarse.mask_given or factor == 1 else ndimage.binary_erosion(coarse.mask, border_value=1)
         zone = np.ones(object_.shape, np.int8)
         zone[ndimage.binary_erosion(object_, iterations=BAND, border_value=1)] = 2
-        zone[~ndimage.binary_dilation(object_, iterations=BAND)] = 0
+        zone[~dilated(object_, BAND)] = 0
         shown = Volume.from_array(np.asarray(coarse.volume.values)[inside], spacing_mm=coarse.spacing)
         threshold = None if coarse.mask_given else object_threshold(shown)
         edge = block_edge(int(coarse.mask.sum()) * factor**3)

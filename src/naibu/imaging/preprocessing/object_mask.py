@@ -12,6 +12,7 @@ from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.aerated_tissue import aerated_tissue, meets_body, summed
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
 from naibu.imaging.preprocessing.field_of_view import Box, in_box
+from naibu.imaging.preprocessing.morphology import closed_by_steps, dilated
 from naibu.imaging.preprocessing.pixel_padding import padding_as_air
 
 # empirical: upper bound of the threshold, in fractions from the mean of the air to that of the object: skin is darker than the mean
@@ -62,10 +63,8 @@ def object_mask(volume: Volume, *, margin: int = 0) -> BoolArray:
     found = smooth > _limit(smooth)
     labels, _ = ndimage.label(found)
     found = labels == 1 + np.argmax(np.bincount(labels.ravel())[1:])
-    pad = CLOSING + 1
-    found = ndimage.binary_closing(np.pad(found, pad), iterations=CLOSING)[pad:-pad, pad:-pad, pad:-pad]
-    found = _with_cavities(found, values, volume.spacing_mm)
-    return np.asarray(ndimage.binary_dilation(found, iterations=margin) if margin else found)
+    found = _with_cavities(closed_by_steps(found, CLOSING), values, volume.spacing_mm)
+    return dilated(found, margin) if margin else found
 
 
 def object_threshold(volume: Volume) -> float:
@@ -183,7 +182,7 @@ def left_out(volume: Volume, mask: BoolArray, view: Box) -> LeftOut:
     dark = smooth <= _limit(smooth)
     surrounded = dark & ~inside & (meets_body(inside) >= SURROUNDED)
     # the outline is closed, and what is blurred about it is bright
-    near = ndimage.binary_dilation(inside, iterations=CLOSING + 1)
+    near = dilated(inside, CLOSING + 1)
     size = max(int(inside.sum()), 1)
     return LeftOut(float(surrounded.sum()) / size, float((~dark & ~near).sum()) / size)
 
