@@ -25,6 +25,7 @@ SAID = {
         ("states of 'cube' are chosen with `states`", "states of 'cube' are chosen with --state"),
         ("element_size_mm=-3: must be positive", "--element-size-mm=-3: must be positive"),
         ("the material is not known: is it new?", "the material is not known: is it new?"),
+        ("if it is right, give check_components=False", "if it is right, give --no-check-components"),
     ],
     "track": [
         ("mask is empty", "--mask is empty"),

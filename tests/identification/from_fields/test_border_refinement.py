@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.forward.field_laws import field_law
+from naibu.identification.from_fields.forward.field_laws import LawName, field_law
 from naibu.identification.from_fields.forward.forward_model import Solvers, equilibrium
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.refinement import Refinement
-from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, logarithms, moduli_of, young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, first_point, search
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph
-from naibu.identification.from_fields.regions import segmentation
+from naibu.identification.from_fields.mesh_error import ModuliOn, changes_on_finer_mesh
+from naibu.identification.from_fields.regions import border_refinement, segmentation
 from naibu.identification.from_fields.regions.border_refinement import (
     RefinedRegions,
     on_finer_cells,
@@ -256,6 +257,31 @@ def test_corrections_for_the_size_of_cells_find_what_smaller_cells_made() -> Non
     alike = replace(corrected, refined=replace(corrected.refined, theta=np.repeat(theta.reshape(2, -1)[:, 0], 2)))  # on the small cells
     fewer = without_errors_of_cells(again, regions, graph, alike, Bounds())
     assert fewer is not None and fewer.zones.count == 1 and not fewer.of_zone.any()
+
+
+def test_residuals_after_a_correction_that_was_taken_back_are_those_before_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And not those that the correction promised: the second time, smaller cells leave more."""
+    fields, zones = model(7)
+    theta = logarithms(*np.array([lame_parameters(e, 0.45) for e in (5.0, 15.0)]).T)
+    mixing = Mixing.of(fields, Borders.of(fields.mesh, zones))
+    again, start = _measured(fields, mixing.moduli(theta, mixing.borders.moves.ravel())[0], seed=1)
+    found = refined_borders(again, zones, replace(start, theta=theta), Bounds())
+    seen: list[np.ndarray] = []
+
+    def worse_next(at: Linearised, law: LawName, moduli_on: ModuliOn) -> tuple[list[np.ndarray], LawName] | None:
+        told = changes_on_finer_mesh(at, law, moduli_on)
+        assert told is not None
+        (change,), of = told
+        seen.append(at.model.observed[0].residual(at.point.states[0]) + change)
+        return [change + (10.0 if len(seen) > 1 else 0.0)], of
+
+    monkeypatch.setattr(border_refinement, "changes_on_finer_mesh", worse_next)
+    monkeypatch.setattr(border_refinement, "CORRECTED", 0.0)
+    monkeypatch.setattr(border_refinement, "WITHIN", 0.0)
+    corrected = on_finer_cells(again, "linear", found, Bounds())
+    assert corrected is not None and len(seen) == 2
+    assert corrected.undone.any() and not corrected.shift.any()
+    np.testing.assert_allclose(corrected.residuals[0], seen[0], rtol=1e-9, atol=1e-9)
 
 
 def refined_borders_at(fields: FieldModel, borders: Borders) -> RefinedRegions:

@@ -14,6 +14,8 @@ from naibu.identification.from_fields import mesh_error
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.mesh_error import TOO_COARSE
+from naibu.identification.from_fields.verdict import FEW_POINTS, told_points
 from naibu.identification.verdict import Explanation
 from naibu.meshing.surface import boundary_faces
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved
@@ -169,3 +171,10 @@ def test_points_that_hold_the_misfit_are_named() -> None:
     assert bad is not None and bad.explanation is not Explanation.EXPLAINED
     assert "75 % of the misfit is that of" in bad.reasons[0]
     assert other is not None and "of the points" not in " ".join(other.reasons)
+
+
+def test_advice_for_too_few_points_and_for_too_coarse_elements_goes_together() -> None:
+    """Both hold of a map of as many cells as points: more points mend either, where larger or smaller elements would mend but one."""
+    for told in (told_points(1500, 1600), FEW_POINTS):
+        assert "measure more" in told and "or use larger" in told
+    assert "points" in TOO_COARSE.partition("use smaller")[2]

@@ -42,6 +42,7 @@ def in_options(message: str, app: App, tokens: Sequence[str]) -> str:
         if "_" in name:
             patterns.append(rf"(?<![\w.\-/'\"`\[]){word}(?![\w\-/'\"`(]|\.\w)")
         message = re.sub("|".join(patterns), option, message)
+    message = re.sub(r"--([\w\-]+)=False\b", r"--no-\1", message)  # a flag that is on by default
     return re.sub(r"(?<=for example )\(([-\d., ]+)\)", lambda found: found[1].replace(",", ""), message)  # several values of an option
 
 

@@ -36,7 +36,7 @@ THIN = 0.5  # as large a change is reckoned with where a zone is one cell thick,
 ITSELF = 3.0  # times as much for the moduli of that zone: skins of virtual legs came out several times too soft
 ONE_CELL = 0.25  # part of the cells of a zone that lie between others on opposite sides, from which it is called one cell thick
 MOST_UNKNOWNS = 600_000  # of the finer mesh
-TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones."
+TOO_COARSE = "The elements are too coarse for extrapolation to be trusted, and intervals are wide: use smaller ones, and points for them."
 ONE_CELL_THICK = "One element thick in a large part: {}. Moduli may be wrong by a third, theirs several times: see intervals."
 ModuliOn = Callable[[Mesh, Zones], tuple[FloatArray, FloatArray]]  # lambda and mu, kPa, of the cells of a mesh
 

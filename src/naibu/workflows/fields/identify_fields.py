@@ -204,14 +204,13 @@ def identify_fields(
     inside, labels = labelled_object(mask, zones)
     read = [placed_on_scan(field, spacing_mm, inside) for field in read]
     names = names_of_labels(labels, inside, zone_names or {})
-    stated = _stated(known, list(names.values()), each_cell=each_cell)
+    given = stated = _stated(known, list(names.values()), each_cell=each_cell)
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     scanned = ScannedObject(inside, labels, names, tuple((Path(p).stem, f) for p, f in zip(paths, read, strict=True)), tuple(loaded))
     points = max(int(field.valid.sum()) for field in read)
     usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS)
     size = element_size_mm or scanned.edge_mm(usual)
     sought = () if each_cell else set(names.values()) - set(stated.values)
-    given = stated
     if not each_cell:
         scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0, known=stated.not_rigid)
         sought, stated = set(sought) & set(scanned.names.values()), stated.without(set(names.values()) - set(scanned.names.values()))

@@ -45,8 +45,8 @@ def told_order(found: LikelierOrder) -> str:
     return (
         f"a homogeneous body leaves {_percent(found.unexplained)} of the deformation unexplained (root mean square), and would leave "
         f"{_percent(found.least)} if displacements had other signs or another order of components. They are likely not in the frame of the "
-        f"positions: {mends}. If they are right, and forces act at no other sides than `loaded` names, such as of a body of negative "
-        "Poisson's ratio, give check_components=False (--no-check-components)"
+        f"positions: {mends}. If they are right, as a body of negative Poisson's ratio may show them, and forces act at no sides but those "
+        "that `loaded` names, give check_components=False"
     )
 
 

@@ -294,7 +294,8 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     mixing, n, edge = found.mixing, len(found.theta), found.mixing.borders.edge_mm
     here, now, objective = _Trial(found.theta, found.borders.moves.ravel(), found.point, found.objective), found, Objective(bounds=bounds)
     prior = _prior(mixing)
-    residuals, converged, before, least, of_law = tuple[FloatArray, ...](), False, here, np.inf, True
+    residuals, of_before = tuple[FloatArray, ...](), tuple[FloatArray, ...]()
+    converged, before, least, of_law = False, here, np.inf, True
     undone = np.zeros(n)
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
@@ -302,11 +303,12 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
         if finer is None:
             return None
         changes, of_law = finer[0], finer[1] == law
-        left = sum(float(np.sum((o.residual(u) + c) ** 2)) for o, u, c in zip(model.observed, at.point.states, changes, strict=True))
+        there = tuple(o.residual(u) + c for o, u, c in zip(model.observed, at.point.states, changes, strict=True))
+        left = sum(float(r @ r) for r in there)
         if left > least:  # surfaces that follow precise data move differently among smaller cells: no more can be said
-            undone, here = here.theta - before.theta, before
+            undone, here, residuals = here.theta - before.theta, before, of_before  # not those that the step promised
             break
-        before, least = here, left
+        before, least, of_before = here, left, there
         slopes = mixing.moduli(here.theta, here.moves)[1]
         quadratic = at.concentrated(slopes, ROUGH_TOLERANCE)
         hessian = quadratic.hessian + prior.hessian(here.theta)
