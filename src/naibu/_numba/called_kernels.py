@@ -37,6 +37,7 @@ class CalledLibrary(JITCodeLibrary):
     """Code of a called kernel: ready to be linked, never made into machine code."""
 
     codegen = _NoPlaces()  # type: ignore[assignment]
+    linked_only = True  # see `naibu._numba.shortcuts.LINKED_ONLY`
 
     def add_ir_module(self, ir_module: Any) -> None:
         """Take in code, but for a wrapper for Python, which Numba makes of the body of each parallel loop."""

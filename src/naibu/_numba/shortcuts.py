@@ -10,7 +10,8 @@ They take the place of functions of Numba while a kernel of naibu is compiled (`
 - how an operator acts on numbers is found once, not for each place where it stands: some twenty templates are tried each time;
 - which variables are alive at each block's begin is found for those who ask, which are generators and compilations for the interpreter;
 - what was registered with Numba is gone through again when there is more of it, not once more for each kernel that is called;
-- the size of a plain type is asked of LLVM once.
+- the size of a plain type is asked of LLVM once;
+- wrappers for callers in C are not made of those functions of Numba that kernels call.
 """
 
 from __future__ import annotations
@@ -19,15 +20,18 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from numba.core import analysis, base, event, ir, postproc, targetconfig, transforms, types
+from numba.core import analysis, base, event, ir, lowering, postproc, targetconfig, transforms, types
 from numba.core.types import functions
 from numba.core.typing import context as typing_context
+
+LINKED_ONLY = "linked_only"  # what libraries have that are never made into machine code
 
 _find_call_type: Any = functions.BaseFunction.get_call_type
 _process: Any = postproc.PostProcessor.run
 _refresh: Any = base.BaseContext.refresh
 _refresh_typing: Any = typing_context.BaseContext.refresh
 _find_size: Any = base.BaseContext.get_abi_sizeof
+_wrap_for_c: Any = lowering.BaseLower.create_cfunc_wrapper
 _hash_of_names: Any = targetconfig.TargetConfig.__hash__  # the same for all configurations of a class
 _NUMBERS = (types.Integer, types.Float, types.Boolean, types.IntegerLiteral, types.BooleanLiteral)
 
@@ -68,6 +72,7 @@ def _substitutes(config: Any) -> tuple[tuple[Any, str, Any], ...]:
         (base.BaseContext, "refresh", _refreshed),
         (typing_context.BaseContext, "refresh", _refreshed_typing),
         (base.BaseContext, "get_abi_sizeof", _size),
+        (lowering.BaseLower, "create_cfunc_wrapper", _wrapped_for_c),
     )
 
 
@@ -214,3 +219,8 @@ def _size(self: Any, kind: Any) -> int:
     if known is None:
         known = _sizes[id(layout), text] = layout, _find_size(self, kind)
     return known[1]
+
+
+def _wrapped_for_c(self: Any) -> None:
+    if not getattr(self.library, LINKED_ONLY, False):
+        _wrap_for_c(self)
