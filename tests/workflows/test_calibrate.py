@@ -136,6 +136,36 @@ def test_records_that_point_the_other_way_are_refused(inputs: tuple[Path, Path, 
     assert not list((tmp_path / "out").glob("*"))
 
 
+def altered(sensor: Path, *, late_ms: float, offset_n: float) -> None:
+    """Let a record be late, and its sensor not tared along z."""
+    lines = sensor.read_text(encoding="utf-8").splitlines()
+    rows = [[float(cell) for cell in line.split(",")] for line in lines[1:]]
+    sensor.write_text("\n".join([lines[0], *(f"{t + late_ms},{x},{y},{z + offset_n}" for t, x, y, z in rows)]), encoding="utf-8")
+
+
+def test_a_late_clock_and_a_sensor_that_was_not_tared_are_estimated_and_told(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, _, sensor = inputs
+    altered(sensor, late_ms=8.0, offset_n=-0.3)
+    run = calibrate_study(study, forces=[sensor], out=tmp_path / "out", groups="all")
+    low, high = run.estimate.intervals().T
+    assert (low < [45.0, 5.0]).all() and (high > [45.0, 5.0]).all()
+    told = {error["quantity"]: error for error in json.loads(run.files[1].read_text(encoding="utf-8"))["sensor_errors"]}
+    assert told["delay"]["value"] == pytest.approx(0.008, abs=0.001)
+    assert told["offset along z"]["value"] == pytest.approx(-300.0, abs=4.0 * told["offset along z"]["sd"])
+    assert any("stamp has a delay of" in warning and "ms" in warning for warning in run.warnings)
+    assert any("an offset of -0.3" in warning and "N on z" in warning and "not tared" in warning for warning in run.warnings)
+    assert "Errors of the force sensors" in run.files[0].read_text(encoding="utf-8")
+
+
+def test_errors_of_a_sensor_that_are_said_not_to_be_there_are_named(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, _, sensor = inputs
+    altered(sensor, late_ms=0.0, offset_n=0.3)
+    run = calibrate_study(study, forces=[sensor], out=tmp_path / "out", groups="all", sensor_errors="none")
+    assert any("an offset of 0.3" in warning and "perhaps not tared" in warning and "'offset'" in warning for warning in run.warnings)
+    low, high = run.estimate.intervals().T
+    assert (low < [45.0, 5.0]).all() and (high > [45.0, 5.0]).all()
+
+
 @pytest.mark.parametrize(
     ("header", "order", "told"),
     [

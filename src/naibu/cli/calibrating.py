@@ -40,6 +40,7 @@ def calibrate(
     method: Literal["gauss-newton", "cma-es", "genetic"] = "gauss-newton",
     point_sd_mm: float = 0.5,
     force_sd_mn: float | None = None,
+    sensor_errors: Literal["none", "offset", "delay", "offset and delay", "drift", "drift and delay"] = "offset and delay",
     max_runs: Whole = 2000,
     seed: Whole = 0,
     threads: Whole = 2,
@@ -77,6 +78,9 @@ def calibrate(
         Standard deviation of a coordinate of the captured points, mm.
     force_sd_mn
         Standard deviation of a component of a force in one sample, mN; by default estimated from the records.
+    sensor_errors
+        Errors of the force sensors that are estimated along: an offset (they were not tared), a delay of their clocks, a drift (with an
+        offset), or none.
     max_runs
         Number of simulations of a search without derivatives, at most.
     seed
@@ -110,8 +114,8 @@ def calibrate(
 
         run = calibrate_study(
             study, shapes=shapes or (), forces=forces or (), out=out, groups=groups, friction=friction, pull_off=pull_off, method=method,
-            point_sd_mm=point_sd_mm, force_sd_mn=force_sd_mn, max_runs=max_runs, seed=seed, threads=threads, starts=starts,
-            overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments,
+            point_sd_mm=point_sd_mm, force_sd_mn=force_sd_mn, sensor_errors=sensor_errors, max_runs=max_runs,
+            seed=seed, threads=threads, starts=starts, overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments,
         )  # fmt: skip
     _show(run)
     say(f"{time.perf_counter() - began:.0f} s. Page: {run.files[0]}   numbers: {run.files[1]}   study: {run.files[2]}")

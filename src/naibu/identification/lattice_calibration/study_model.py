@@ -152,6 +152,7 @@ class StudyModel:
                 return found
         else:
             found, tangents = self._touching(trial), []
+        assert found.history is not None
         by_tangent = iter(zip(found.positions_change, found.force_change, found.history.change, strict=True))
         slopes = [next(by_tangent) if tangents and c.tangent is not None else self._difference(found, c) for c in changes]
         if not slopes:
@@ -161,6 +162,7 @@ class StudyModel:
 
     def _difference(self, found: Reproduced, change: TrialChange) -> tuple[FloatArray, FloatArray, FloatArray]:
         moved, by = self._tied(change.moved, ()) if self.study.tied else self._touching(change.moved), np.expm1(change.shift)
+        assert found.history is not None and moved.history is not None
         history = (moved.history.force - found.history.force) / by
         return (moved.positions - found.positions) / by, (moved.force - found.force) / by, history
 

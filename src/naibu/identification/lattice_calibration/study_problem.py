@@ -94,12 +94,19 @@ class StudyProblem:
         Raises
         ------
         InputError
-            Neither points nor forces, points far away from the object or in another unit, or what `StudyModel.of` refuses.
+            Neither points nor forces, records too short for the errors of their sensors, points far away from the object or in another
+            unit, or what `StudyModel.of` refuses.
         """
         require_positive(point_sd_mm, "point_sd_mm", "mm")
         study = unknowns.study
         if not captures and not np.isfinite(forces.force).any():
             raise InputError("there are neither captured points nor recorded forces; give at least one of the two")
+        counts = np.isfinite(forces.force).all(axis=2).sum(axis=0)
+        if (few := counts[counts > 0]).size and few.min() <= sensor_errors.steady + int(sensor_errors.delay):
+            raise InputError(
+                f"a record of forces has samples in {few.min()} windows of time only, which cannot tell errors of its sensor as well: set "
+                "sensor_errors to 'none', or record more"
+            )
         lattice = study.lattice
         hull, reach = surface_of(lattice), float(np.linalg.norm(np.ptp(lattice.points, axis=0)))
         clouds = []

@@ -7,7 +7,7 @@ import os
 import shutil
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any, get_args
@@ -19,7 +19,9 @@ from naibu.core.arrays import require_within
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
+from naibu.identification.lattice_calibration.captured.sensor_errors import NO_ERRORS, SensorErrorNames, SensorErrors
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
+from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import diagnosed, sensor_errors_found
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import PULL_OFF, Friction, Groups, StudyUnknowns
 from naibu.io.files.atomic import write_atomically
@@ -33,6 +35,7 @@ from naibu.viewer.notebook import WrittenResult
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers, start_numbers
+from naibu.workflows.studies.calibration_sensors import sensor_warnings
 from naibu.workflows.studies.calibration_starts import CalibratedFromStarts, Method, calibrate_from_starts, searched
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
 
@@ -84,6 +87,7 @@ def calibrate_study(
     method: Method = "gauss-newton",
     point_sd_mm: float = POINT_SD_MM,
     force_sd_mn: float | None = None,
+    sensor_errors: SensorErrorNames = "offset and delay",
     max_runs: int = 2000,
     seed: int = 0,
     threads: int = 2,
@@ -115,6 +119,9 @@ def calibrate_study(
         Standard deviation of a coordinate of the captured points.
     force_sd_mn : float
         Standard deviation of a component of a force in one sample; by default estimated from the records.
+    sensor_errors : str
+        Errors of the force sensors that are estimated along, of each by itself: an ``"offset"`` of every component (a sensor that was not
+        tared), a ``"delay"`` of its clock, a ``"drift"`` (an offset and what grows evenly with time), two of them, or ``"none"``.
     max_runs : int
         Simulations of a search without derivatives, at most.
     seed : int
@@ -149,26 +156,30 @@ def calibrate_study(
     captured = read_captured_shapes(shapes) if shapes else ()
     records = read_force_records(forces) if forces else ()
     unknowns = StudyUnknowns.of(prepared.study, groups=groups, friction=friction, pull_off=pull_off)
-    problem = _problem(prepared, unknowns, captured, records, point_sd_mm, force_sd_mn)
+    problem = _problem(prepared, unknowns, captured, records, point_sd_mm, force_sd_mn, SensorErrors.named(sensor_errors))
     name = f"{prepared.name}-calibrated.toml"
     folder = output_folder(out, ("calibration.html", "calibration.json", name), overwrite=overwrite)
-    before = Compared.of(problem, unknowns.start)
-    _check_directions(prepared, before)
+    before = Compared.of(replace(problem, sensor_errors=NO_ERRORS), unknowns.start)
+    _check_directions(prepared, before, tared=not problem.sensor_errors.offset)
     estimate, several = _searched(problem, starts, where, progress, method=method, seed=seed, max_runs=max_runs, threads=threads)
+    diagnosis = diagnosed(problem, estimate) if estimate.finished else None
+    estimate = diagnosis.estimate if diagnosis else estimate
+    sensors = sensor_errors_found(problem, estimate)
     after = Compared.of(problem, estimate.values)
     settings = calibrated_settings(prepared.settings, estimate)
     inputs = {**prepared.inputs, **_hashes((*shapes, *forces))}
     options: dict[str, str | float | int | None] = {
         "study": prepared.source, "method": method, "groups": groups, "friction": friction, "point_sd_mm": point_sd_mm, "seed": seed,
-        "starts": starts,
+        "starts": starts, "sensor_errors": sensor_errors,
         **{f"SHA-256 of {file}": digest for file, digest in inputs.items()},
     }  # fmt: skip
-    warnings = (*_warnings_of_starts(several), *_warnings(problem, estimate, before))
-    chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options, several)
+    warnings = (*_warnings_of_starts(several), *sensor_warnings(problem, diagnosis, sensors), *_warnings(problem, estimate, before))
+    chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options, several, sensors)
     comment = f"{prepared.title}, calibrated by naibu {__version__} from {', '.join(map(_file_name, (*shapes, *forces)))}"
     target = write_atomically(folder / name, study_document(_with_volumes(prepared, settings, folder), comment))
     page = write_atomically(folder / "calibration.html", chapter_html(chapter))
     numbers = {**_numbers(estimate), "misfit": misfit_numbers(problem, before, after), "warnings": list(warnings), "settings": options}
+    numbers["sensor_errors"] = [asdict(error) for error in sensors]
     if several:
         numbers["starts"] = start_numbers(several)
     written = write_atomically(folder / "calibration.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")
@@ -211,6 +222,7 @@ def _problem(
     records: Sequence[ForceRecord],
     point_sd_mm: float,
     force_sd_mn: float | None,
+    errors: SensorErrors,
 ) -> StudyProblem:
     study = prepared.study
     names = [body.name for body in study.bodies]
@@ -229,14 +241,19 @@ def _problem(
             )
         placed.append((names.index(record.indenter) if record.indenter else movable[0], record.times_s, record.force))
     recorded = RecordedForces.of(study, placed, sd_mn=force_sd_mn)
-    return StudyProblem.of(unknowns, [(c.time_s, c.points) for c in captured], recorded, point_sd_mm=point_sd_mm)
+    return StudyProblem.of(unknowns, [(c.time_s, c.points) for c in captured], recorded, point_sd_mm=point_sd_mm, sensor_errors=errors)
 
 
-def _check_directions(prepared: PreparedStudy, before: Compared) -> None:
-    """Refuse records that hold what the object exerts on the sensor, along other axes, or in another unit than the one that is named."""
+def _check_directions(prepared: PreparedStudy, before: Compared, *, tared: bool) -> None:
+    """Refuse records that hold what the object exerts on the sensor, along other axes, or in another unit than the one that is named.
+
+    Of sensors that are not `tared` changes are compared.
+    """
     for body, name in enumerate(b.name for b in prepared.study.bodies):
         counted = np.isfinite(before.measured[:, body])
         seen, ours = before.measured[:, body][counted[:, 0]], before.force[:, body][counted[:, 0]]
+        if not tared and len(seen):
+            seen, ours = seen - seen.mean(axis=0), ours - ours.mean(axis=0)
         sizes = float(np.sqrt((seen**2).sum() * (ours**2).sum()))
         if not sizes > 0.0:
             continue

@@ -11,10 +11,12 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.captured.shape_distance import closest_points
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
+from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import SensorError
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.io.tables.force_records import ForceRecord
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table
+from naibu.workflows.studies.calibration_sensors import sensor_section
 from naibu.workflows.studies.calibration_starts import CalibratedFromStarts
 
 if TYPE_CHECKING:
@@ -37,7 +39,8 @@ class Compared:
     force_times : ndarray, shape (windows,)
         Middles of the windows, s.
     measured, force : ndarray, shape (windows, bodies, 3)
-        Mean forces, mN; NaN where nothing was recorded.
+        Mean forces, mN; NaN where nothing was recorded: of the record, without the offset of its sensor, and simulated, as late as its
+        clock.
     """
 
     times: tuple[float, ...]
@@ -55,7 +58,11 @@ class Compared:
         times = tuple(step * model.study.step_s for step in model.captures)
         distance = tuple(closest_points(p, model.hull, x).signed for p, x in zip(load_case.points, found.positions, strict=True))
         middles = np.asarray(model.long_step * (np.arange(model.windows) + 0.5), dtype=np.float64)
-        return cls(times, distance, middles, load_case.forces.force, found.force)
+        measured, force = load_case.forces.force.copy(), found.force.copy()
+        for body, own in problem.of_bodies(load_case.forces, found).items():
+            force[:, body] = own.means
+            measured[own.counted, body] = own.measured
+        return cls(times, distance, middles, measured, force)
 
 
 def held_intervals(estimate: LatticeEstimate) -> FloatArray:
@@ -105,8 +112,9 @@ def calibration_chapter(
     warnings: Sequence[str],
     settings: Mapping[str, Cell],
     several: CalibratedFromStarts | None = None,
+    sensors: Sequence[SensorError] = (),
 ) -> Chapter:
-    """Return the page of a calibration; with `several`, of that from several starts."""
+    """Return the page of a calibration; with `several`, of that from several starts, and with errors of sensors where these were sought."""
     sections = [_estimates(problem, estimate, warnings)]
     numbers = misfit_numbers(problem, before, after)
     if after.times:
@@ -117,6 +125,7 @@ def calibration_chapter(
         sections.append(Section("Shapes", (text,), (Table("Distance of the captured points", columns, rows),), (figure,)))
     if numbers["forces"]:
         sections.append(_forces(problem, before, after, records, numbers))
+    sections += sensor_section(sensors)
     if several:
         sections.append(_starts(several))
     return Chapter("calibration", f"Calibration: {title}", tuple(sections), dict(settings))

@@ -64,7 +64,7 @@ class DelayedMeans:
         impulse = np.concatenate([np.zeros((1, force.shape[1])), np.cumsum(force * each, axis=0)])
         inner = (force[:-1] * each[1:] + force[1:] * each[:-1]) / (each[1:] + each[:-1])
         slope = np.concatenate([force[:1], inner, force[-1:]])
-        return cls(borders, impulse, slope, step_s * np.arange(len(shares) + 1), shares, window_steps)
+        return cls(borders, impulse, slope, np.asarray(step_s * np.arange(len(shares) + 1), dtype=np.float64), shares, window_steps)
 
     def __call__(self, delay: float) -> tuple[FloatArray, FloatArray]:
         """Return means (windows, k) of forces that are seen later by a delay, s, and their derivatives by it."""

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 import scipy.optimize
 
 from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.captured.force_history import DelayedMeans, ForceHistory
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 
@@ -41,10 +43,27 @@ class SensorErrors:
     drift: bool = False
     delay: bool = False
 
+    @classmethod
+    def named(cls, name: SensorErrorNames) -> SensorErrors:
+        """Return those that go by a name; a drift has an offset.
+
+        Raises
+        ------
+        InputError
+            Another name.
+        """
+        if name not in get_args(SensorErrorNames):
+            raise InputError(f"sensor_errors is {name!r}; choose one of {', '.join(get_args(SensorErrorNames))}")
+        return cls("offset" in name or "drift" in name, "drift" in name, "delay" in name)
+
     @property
     def any(self) -> bool:
         """Whether there is one."""
         return self.offset or self.drift or self.delay
+
+    def holds(self, other: SensorErrors) -> bool:
+        """Return whether all of another one are among these."""
+        return self.steady >= other.steady and self.delay >= other.delay
 
     @property
     def steady(self) -> int:
@@ -53,6 +72,7 @@ class SensorErrors:
 
 
 NO_ERRORS = SensorErrors()
+SensorErrorNames = Literal["none", "offset", "delay", "offset and delay", "drift", "drift and delay"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,6 +91,10 @@ class BodyResiduals:
         How they change with the parameters.
     explained_variance : ndarray, shape (k,)
         Of each component, at known parameters.
+    means : ndarray, shape (windows, 3)
+        Simulated means, as late as the clock, mN.
+    measured : ndarray, shape (n, 3)
+        Recorded means of the counted windows without the offset, mN.
     delay : float
         s; 0 where none was sought.
     delay_slopes : ndarray, shape (p,)
@@ -85,6 +109,8 @@ class BodyResiduals:
     explained: FloatArray
     explained_slopes: FloatArray
     explained_variance: FloatArray
+    means: FloatArray
+    measured: FloatArray
     delay: float
     delay_slopes: FloatArray
     delay_variance: float
@@ -120,7 +146,7 @@ def body_residuals(
         Factor of the noise.
     """
     seen = record.force[:, body]
-    counted = np.isfinite(seen).all(axis=1)
+    counted = np.asarray(np.isfinite(seen).all(axis=1))
     weight = np.sqrt(record.samples[counted, body])[:, None] / (excess * record.sd_mn[body])
     middle = record.window_steps * step_s * (np.flatnonzero(counted) + 0.5)
     design = np.power.outer(middle - middle.mean(), np.arange(errors.steady))
@@ -150,8 +176,10 @@ def body_residuals(
     of_delay = back @ basis.T @ (weight * rate[counted])
     explained_slopes = -(back @ basis.T @ raw_slopes) - delay_slopes[:, None, None] * of_delay
     spread = (back @ back.T).diagonal() + variance * (of_delay**2).max(axis=1, initial=0.0) * float(errors.delay)
+    explained = -(back @ basis.T @ raw)
     return BodyResiduals(
-        counted, residual, slopes, -(back @ basis.T @ raw), explained_slopes, spread, delay, delay_slopes, variance if errors.delay else 0.0
+        counted, residual, slopes, explained, explained_slopes, spread, means, seen[counted] - design @ explained, delay, delay_slopes,
+        variance if errors.delay else 0.0,
     )  # fmt: skip
 
 

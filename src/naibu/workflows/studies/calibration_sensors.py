@@ -1,0 +1,75 @@
+"""What a calibration tells of its force sensors: errors that were found, and errors that would explain what it lacks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from naibu.identification.lattice_calibration.captured.sensor_errors import MOST_DELAY_S, SensorErrors
+from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import TOLD, SensorDiagnosis, SensorError
+from naibu.identification.lattice_calibration.study_problem import StudyProblem
+from naibu.viewer.chapters.chapter import Section
+from naibu.viewer.tables import Table
+
+LARGE = 0.02  # of the largest force of the record: an offset or a drift that is a warning
+LATE = 0.25  # of a window of time: a delay that is one
+AT_THE_END = 0.95  # of the longest delay that is sought
+
+
+def sensor_warnings(problem: StudyProblem, diagnosis: SensorDiagnosis | None, sensors: Sequence[SensorError]) -> tuple[str, ...]:
+    """Return in words what a reader must know of the sensors."""
+    found = []
+    if diagnosis:
+        named = ", ".join(f"{error} of {error.body}" for error in diagnosis.told) or "such errors"
+        before, after = diagnosis.factors
+        found.append(
+            f"With {named} the forces would be met to {after:.3g} instead of {before:.3g} times their noise: "
+            f"{_perhaps(diagnosis.errors)}; or the law lacks something that looks alike. Intervals reach to where that would move the "
+            f"estimates. To estimate it along, set sensor_errors to {_name(diagnosis.errors)!r}."
+        )
+    for error in sensors:
+        if abs(error.value) > TOLD * error.sd and _matters(problem, error):
+            what = "the clock of the sensor is off" if error.quantity == "delay" else "the sensor was not tared, or drifts"
+            found.append(f"The record of {error.body} has {error}: {what}. This was estimated along, and intervals count it.")
+        if error.quantity == "delay" and abs(error.value) > AT_THE_END * MOST_DELAY_S:
+            found.append(
+                f"The delay of {error.body} is at the end of what is sought, {1e3 * MOST_DELAY_S:g} ms: shift the times of its record, and "
+                "do not rely on these values."
+            )
+    return tuple(found)
+
+
+def sensor_section(sensors: Sequence[SensorError]) -> tuple[Section, ...]:
+    """Return a section of the page with the errors that were found; none if none were sought."""
+    if not sensors:
+        return ()
+    rows = tuple((e.body, e.quantity, e.value, e.value - 1.96 * e.sd, e.value + 1.96 * e.sd, e.unit) for e in sensors)
+    text = (
+        "Errors of the force sensors were estimated along with the parameters, whose intervals hold whatever they are. Where a sensor was "
+        "tared and its clock is that of the indenters, sensor_errors = none makes intervals shorter. A wrong gain of a sensor cannot be "
+        "told from stiffness, nor a slow drift from creep."
+    )
+    table = Table("Errors of the force sensors", ("indenter", "error", "estimate", "95 % from", "to", "unit"), rows)
+    return (Section("Sensors", (text,), (table,)),)
+
+
+def _matters(problem: StudyProblem, error: SensorError) -> bool:
+    forces, study = problem.load_cases[0].forces, problem.unknowns.study
+    if error.quantity == "delay":
+        return abs(error.value) > LATE * forces.window_steps * study.step_s
+    body = [b.name for b in study.bodies].index(error.body)
+    largest = float(np.nanmax(np.abs(forces.force[:, body])))
+    lasts = len(forces.force) * forces.window_steps * study.step_s if error.quantity.startswith("drift") else 1.0
+    return abs(error.value) * lasts > LARGE * largest
+
+
+def _perhaps(errors: SensorErrors) -> str:
+    told = [("a sensor was perhaps not tared", errors.offset and not errors.drift), ("a sensor perhaps drifts", errors.drift)]
+    told.append(("its clock is perhaps off", errors.delay))
+    return ", and ".join(text for text, holds in told if holds)
+
+
+def _name(errors: SensorErrors) -> str:
+    steady = "drift" if errors.drift else "offset" if errors.offset else ""
+    return " and ".join(part for part in (steady, "delay" if errors.delay else "") if part)

@@ -1,0 +1,164 @@
+"""Errors of force sensors: against closed forms, and forces of a voxel that scipy integrates."""
+
+from __future__ import annotations
+
+from itertools import combinations, product
+from pathlib import Path
+
+import numpy as np
+import pytest
+from lattice_studies import study_file
+from scipy.integrate import solve_ivp
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import InputError
+from naibu.identification.lattice_calibration.captured.force_history import DelayedMeans
+from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
+from naibu.identification.lattice_calibration.captured.sensor_errors import NO_ERRORS, SensorErrors
+from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
+from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import diagnosed, sensor_errors_found
+from naibu.identification.lattice_calibration.study_problem import StudyProblem
+from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.workflows.studies.lattice_study import prepared_study
+
+SPACING, DEPTH, ENDS, NOISE_MN = 10.0, 2.0, 0.5, 5.0
+TRUTH = np.array([60.0, 4.0, 50.0])
+BOTH = SensorErrors(offset=True, delay=True)
+
+
+def pressed(times: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far the face is pressed down, mm, and its speed, mm/s: smoothly from 0.1 to 0.25 s."""
+    u = np.clip((times - 0.1) / 0.15, 0.0, 1.0)
+    return DEPTH * u**3 * (10.0 - 15.0 * u + 6.0 * u**2), DEPTH * 30.0 * (u * (1.0 - u)) ** 2 / 0.15
+
+
+PATH = [[round(float(t), 3), 0.0, 0.0, -round(float(pressed(np.array(t))[0]), 6)] for t in np.arange(0.0, ENDS, 0.002)]
+VOXEL = f"""
+[object]
+size_mm = [10, 10, 10]
+mass_g = 1.0
+[lattice]
+spacing_mm = 10.0
+[parameters]
+K = 40.0
+C1 = 6.0
+C2 = 30.0
+[simulation]
+duration_s = {ENDS}
+[floor]
+[[indenter]]
+name = "stamp"
+shape = "box"
+size_mm = [10, 10, 10]
+centre_mm = [5.0, 5.0, 15.0]
+contact = "tied"
+path = {PATH}
+[output]
+every_s = 0.02
+"""
+
+
+def force_of_a_voxel(times: FloatArray) -> FloatArray:
+    """Return the force (n, 3) on the upper face: springs and dashpots between corners that all move as they are told."""
+    corners = [np.array(c) for c in product((0, 1), repeat=3)]
+    across = [np.abs(b - a) for a, b in combinations(corners, 2) if a[2] != b[2]]
+    flat = SPACING * np.array([np.hypot(d[0], d[1]) for d in across])
+    k, c1, c2 = TRUTH
+
+    def lengths(time: float) -> tuple[FloatArray, FloatArray]:
+        height, speed = (float(v) for v in pressed(np.array(time)))
+        length = np.hypot(flat, SPACING - height)
+        return length, -speed * (SPACING - height) / length
+
+    def rate(time: float, z: FloatArray) -> FloatArray:
+        return np.asarray((c2 * lengths(time)[1] - k * z) / (c1 + c2))
+
+    found = solve_ivp(rate, (0.0, ENDS), np.zeros(len(flat)), t_eval=times, rtol=1e-8, atol=1e-10, max_step=0.01)
+    force = np.zeros((len(times), 3))
+    for n, (time, z) in enumerate(zip(times, found.y.T, strict=True)):
+        tension = k * z + c1 * rate(time, z)
+        force[n, 2] = tension @ ((SPACING - float(pressed(np.array(time))[0])) / lengths(time)[0])
+    return force
+
+
+@pytest.fixture(scope="module")
+def times() -> FloatArray:
+    return np.asarray(np.arange(0.0006, ENDS, 0.001))
+
+
+@pytest.fixture(scope="module")
+def clean(times: FloatArray) -> FloatArray:
+    fine = np.linspace(0.0, ENDS, 2001)
+    force = force_of_a_voxel(fine)
+    return np.stack([fine, force[:, 2]])
+
+
+def problem(
+    folder: Path, clean: FloatArray, times: FloatArray, seed: int, errors: SensorErrors, *, late_s: float = 0.0, offset: float = 0.0
+) -> StudyProblem:
+    study = prepared_study(study_file(folder, VOXEL)).study
+    force = np.zeros((len(times), 3))
+    force[:, 2] = np.interp(times - late_s, *clean) + offset
+    force += NOISE_MN * np.random.default_rng(seed).standard_normal(force.shape)
+    recorded = RecordedForces.of(study, [(1, times, force)], sd_mn=NOISE_MN)
+    return StudyProblem.of(StudyUnknowns.of(study, groups="all"), [], recorded, point_sd_mm=0.5, sensor_errors=errors)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.0037, -0.012])
+def test_means_of_delayed_forces_are_integrals(delay: float) -> None:
+    borders = np.concatenate([np.arange(0.0, 0.1, 0.002), np.arange(0.1, 0.401, 0.004)])
+    force = (np.cos(20.0 * borders[:-1]) - np.cos(20.0 * borders[1:])) / (20.0 * np.diff(borders))
+    shares = np.full(200, 0.1)
+    means = DelayedMeans.of(borders, force[:, None], shares, 10, 0.002)
+    edges = 0.02 * np.arange(21) - delay
+    found, rate = means(delay)
+    expected = (np.cos(20.0 * edges[:-1]) - np.cos(20.0 * edges[1:])) / 0.4
+    inside = slice(1, -1)
+    np.testing.assert_allclose(found[inside, 0], expected[inside], atol=1e-4)
+    np.testing.assert_allclose(rate[inside, 0], ((np.sin(20.0 * edges[:-1]) - np.sin(20.0 * edges[1:])) / 0.02)[inside], atol=0.05)
+
+
+@pytest.mark.parametrize(("late_s", "offset"), [(0.0, 0.0), (0.008, 0.0), (-0.02, 0.0), (0.0, 120.0), (0.008, -60.0)])
+def test_intervals_hold_whatever_the_errors_of_the_sensor(
+    tmp_path: Path, clean: FloatArray, times: FloatArray, late_s: float, offset: float
+) -> None:
+    deviations = []
+    for seed in range(4):
+        made = problem(tmp_path, clean, times, seed, BOTH, late_s=late_s, offset=offset)
+        found = calibrate_lattice(made, made.unknowns.start, threads=1)
+        assert found.noise_factor[1] < 1.3
+        deviations.append(np.log(found.values / TRUTH) / np.sqrt(np.diag(found.covariance)))
+        assert found.determined().all()
+        told = {error.quantity: error for error in sensor_errors_found(made, found)}
+        assert told["delay"].value == pytest.approx(late_s, abs=max(4.0 * told["delay"].sd, 0.0005))
+        assert told["offset along z"].value == pytest.approx(offset, abs=4.0 * told["offset along z"].sd)
+    assert np.abs(deviations).max() < 3.5  # once in two hundred such dozens
+    assert (np.abs(deviations) < 1.96).sum() >= 9
+
+
+@pytest.mark.parametrize(("late_s", "offset", "quantity"), [(0.008, 0.0, "delay"), (0.0, 120.0, "offset along z"), (-0.02, 0.0, "delay")])
+def test_errors_that_were_not_sought_are_named_and_intervals_reach_the_truth(
+    tmp_path: Path, clean: FloatArray, times: FloatArray, late_s: float, offset: float, quantity: str
+) -> None:
+    made = problem(tmp_path, clean, times, 0, NO_ERRORS, late_s=late_s, offset=offset)
+    found = calibrate_lattice(made, made.unknowns.start, threads=1)
+    assert found.noise_factor[1] > 2.0
+    told = diagnosed(made, found)
+    assert told is not None and quantity in {error.quantity for error in told.told}
+    low, high = told.estimate.intervals().T
+    assert (low < TRUTH).all() and (high > TRUTH).all()
+    named = next(error for error in told.told if error.quantity == quantity)
+    assert named.value == pytest.approx(late_s or offset, rel=0.2)
+    assert told.factors[1] < 0.3 * told.factors[0]
+
+
+def test_forces_that_fit_are_not_diagnosed(tmp_path: Path, clean: FloatArray, times: FloatArray) -> None:
+    made = problem(tmp_path, clean, times, 1, BOTH)
+    assert diagnosed(made, calibrate_lattice(made, made.unknowns.start, threads=1)) is None
+
+
+def test_a_record_too_short_for_errors_of_its_sensor_is_told(tmp_path: Path, clean: FloatArray) -> None:
+    with pytest.raises(InputError, match="2 windows of time only"):
+        problem(tmp_path, clean, np.arange(0.001, 0.04, 0.001), 0, BOTH)
+    with pytest.raises(InputError, match="choose one of none, offset"):
+        SensorErrors.named("gain")  # type: ignore[arg-type]
