@@ -6,7 +6,7 @@ Frames have the budget of `naibu live`: a step that takes longer goes on in the 
 `static` compares the rest under the tool with the offline solution of `QuasiStaticSession`.
 
 Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [--tool plate] [--speed 24] [--repeatable]
-[--static | --cut | --drag [--lips-friction 0.4] | --rub [--live]]``; a number N is a box of 6 N^3 tetrahedra, nu 0.499.
+[--static | --cut | --pull | --drag [--lips-friction 0.4] | --rub [--live]]``; a number N is a box of 6 N^3 tetrahedra, nu 0.499.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from naibu.meshing import box, to_tetra
 from naibu.simulation import FiniteElementBody, InteractiveSimulation
 from naibu.workflows import tools_for, touchable
 from naibu.workflows.interactive.cut_kernels import compile_for_cuts
-from naibu.workflows.interactive.live import BUDGET_S
+from naibu.workflows.interactive.live import BUDGET_S, DELAY_S
 
 FRAME_S = 1.0 / 60.0
 SHEARED_MM = 6.0
@@ -241,6 +241,37 @@ def rubbed(body: FiniteElementBody, live: bool) -> None:
         simulation.close()
 
 
+def pulled(body: FiniteElementBody) -> None:
+    """Pull a point at the top of a body aside, and lift it, as a hand at the live page does, let go, and print the times of the steps."""
+    for name, way, steps in (("pulled aside", (25.0, 0.0, 10.0), 15), ("lifted", (0.0, 0.0, 40.0), 20)):
+        simulation = InteractiveSimulation(body, tools_for(body), budget_s=BUDGET_S, delay_s=DELAY_S)
+        top = int(np.argmax(body.points @ [0.3, 0.3, 1.0]))
+        simulation.grip(top, 0.08 * simulation.extent_mm)
+        at = body.points[top]
+        led = [at + part * np.array(way) for part in np.linspace(0.0, 1.0, steps + 1)[1:]]
+        seconds, left, failed = [], [], 0
+        for place in [*led, *[led[-1]] * 5, *[None] * 20]:
+            if place is None:
+                simulation.release()
+            else:
+                simulation.pull(place)
+            began, under_way = time.process_time(), True
+            while under_way:
+                frame = simulation.advance()
+                failed += bool(frame.failed)
+                under_way = frame.under_way
+            seconds.append(time.process_time() - began)
+            left.append(frame.unbalanced)
+        late = np.array(seconds) > 0.3
+        print(
+            f"{name} and let go, {len(seconds)} steps: {sum(seconds):.1f} s of all threads, {late.sum()} steps above .3 s take "
+            f"{np.array(seconds)[late].sum():.1f} s, worst {max(seconds):.2f} s; out of balance at most {100.0 * max(left):.0f} %, "
+            f"failed {failed}",
+            flush=True,
+        )
+        simulation.close()
+
+
 def timed(simulation: InteractiveSimulation, name: str, places: Sequence[FloatArray | None]) -> None:
     """Take steps, the gripped nodes led to these places, and print the times of their frames and what was out of balance."""
     ms, left, failed = [], [], 0
@@ -282,6 +313,7 @@ def main() -> None:
     parser.add_argument("--speed", type=float, default=24.0, help="mm/s")
     parser.add_argument("--static", action="store_true")
     parser.add_argument("--cut", action="store_true", help="only time a cut")
+    parser.add_argument("--pull", action="store_true", help="only pull a point aside, and lift it, and let go")
     parser.add_argument("--drag", action="store_true", help="only drag a sphere across a cut and back")
     parser.add_argument("--lips-friction", type=float, default=0.0, help="between the sides of the cut that a sphere is dragged across")
     parser.add_argument("--rub", action="store_true", help="only cut through with friction, and shear")
@@ -292,6 +324,9 @@ def main() -> None:
     print(f"{given.body}: {body.mesh.n_cells} cells, {body.mesh.n_points} nodes; {given.tool}, {given.speed:g} mm/s")
     if given.cut:
         cut(body)
+        return
+    if given.pull:
+        pulled(body)
         return
     if given.drag:
         dragged(body, given.lips_friction)
