@@ -144,8 +144,8 @@ def _unmasked(path: Path, names: list[str], vectors: FloatArray, column: Callabl
     empty = [value for value in values if nothing[column(at) == value].all()]
     if len(values) != 2 or len(empty) != 1:
         raise InputError(
-            f"{path}: the column {names[at]!r} does not tell which points were measured: none of its values stands only where displacements "
-            "are 0 or missing; name it isValid, with 1 where a point was measured and 0 elsewhere"
+            f"{path}: the column {names[at]!r} does not tell which points were measured: none of its values stands only where "
+            "displacements are 0 or missing; name it isValid, 1 where a point was measured and 0 elsewhere"
         )
     return np.asarray(column(at) != empty[0])
 
