@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import struct
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,7 @@ from hypothesis import strategies as st
 from naibu.core.errors import InputError, MissingDependencyError
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.core.volume import Volume
+from naibu.io.image_formats.nifti import ContradictingFormsWarning
 from naibu.io.images import open_volume, read_displacement, read_volume, read_volume_box, write_displacement, write_volume
 
 RNG = np.random.default_rng(5)
@@ -406,3 +409,27 @@ def test_vectors_of_another_shape_or_format_are_refused(tmp_path: Path) -> None:
         read_displacement(tmp_path / "a.mha")
     with pytest.raises(InputError, match="no type for values"):
         write_volume(tmp_path / "b.mha", grid.with_values(np.zeros(grid.shape, dtype=np.longdouble)))
+
+
+@pytest.mark.parametrize(
+    ("sform", "code", "told"),
+    [
+        (np.diag([1.0, 1.0, 3.0, 1.0]), 4, r"sform \(code 4\) .* voxels of 1 x 1 x 3 and of 1 x 1 x 2; the sform was used"),
+        (np.diag([1.0, 1.0, 2.0, 1.0]) + 40.0 * np.eye(4, k=3), 1, "places that are up to 40 .* apart"),
+        (np.diag([1.0, 1.0, 2.0, 1.0]) + 40.0 * np.eye(4, k=3), 4, ""),
+        (np.diag([1.0, 1.0, 2.0, 1.0]), 2, ""),
+    ],
+    ids=["size", "place", "atlas", "alike"],
+)
+def test_forms_of_nifti_that_contradict_each_other_are_told(tmp_path: Path, sform: np.ndarray, code: int, told: str) -> None:
+    nibabel = pytest.importorskip("nibabel")
+    image = nibabel.Nifti1Image(np.zeros((3, 4, 5), dtype="i2"), np.eye(4))
+    image.set_qform(np.diag([1.0, 1.0, 2.0, 1.0]), code=1)
+    image.set_sform(sform, code=code)
+    nibabel.save(image, tmp_path / "a.nii")
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        volume = read_volume(tmp_path / "a.nii")
+    messages = [str(each.message) for each in warned if each.category is ContradictingFormsWarning]
+    assert len(messages) == bool(told) and all(re.search(told, message) for message in messages)
+    assert volume.spacing_mm[2] == sform[2, 2]

@@ -431,3 +431,24 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
             read_field(path, **arguments)
     with pytest.raises(InputError, match="states its own: leave it out"):
         read_field(tmp_path / "field.mha", spacing_mm=(1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize("masked", [0, 1])
+@pytest.mark.parametrize("ending", [".dat", ".csv"])
+def test_a_mask_is_what_the_displacements_beside_it_say(tmp_path: Path, masked: int, ending: str) -> None:
+    """Some programs mark what is masked, others what is left; both write zeros there."""
+    rows = [f"{x},{y},0,{0.1 * (x != 1)},{0.2 * (x != 1)},0,{masked if x == 1 else 1 - masked}" for y in range(2) for x in range(4)]
+    header = "x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm,mask"
+    if ending == ".dat":
+        header = "VARIABLES = " + " ".join(f'"{name}"' for name in header.split(",")) + "\nZONE I=4, J=2, F=POINT"
+        rows = [row.replace(",", " ") for row in rows]
+    (file := tmp_path / f"field{ending}").write_text("\n".join([header, *rows]), encoding="utf-8")
+    field = read_field(file)
+    np.testing.assert_array_equal(field.valid, field.points[:, 0] != 1.0)
+
+
+def test_a_mask_that_does_not_tell_what_it_marks_is_refused(tmp_path: Path) -> None:
+    rows = "".join(f"{x},0,0,0.1,0,0,{int(x == 1)}\n" for x in range(4))
+    (file := tmp_path / "field.csv").write_text(f"x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm,mask\n{rows}", encoding="utf-8")
+    with pytest.raises(InputError, match=r"'mask' does not tell which points were measured.*isValid"):
+        read_field(file)

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import gzip
 import math
+import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +21,12 @@ from naibu.io.image_formats.geometry import FLIP_RAS, ReadOptions, three_axes, u
 # codes of the header: vectors, and displacement vectors, whose components are along the axes of the file (nifti1.h)
 _VECTOR, _DISPLACEMENT = 1007, 1006
 _FSL = range(2006, 2019)  # codes that FSL gives to its warps
+_ALIKE, _HALF_VOXEL = 0.01, 0.5  # of sizes of voxels; of one of them, where two forms of the same place put the corners of a volume
 _STORED = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
+
+
+class ContradictingFormsWarning(UserWarning):
+    """The two forms of a header place or scale the voxels differently."""
 
 
 def read(path: Path, options: ReadOptions) -> Volume:
@@ -44,6 +51,7 @@ def read(path: Path, options: ReadOptions) -> Volume:
             f"{path.name}: contains colours or complex numbers ({stored.dtype}), not intensities; convert it to greyscale first"
         )
     values = three_axes(path.name, np.asarray(stored).T)
+    _warn_of_contradicting_forms(path, image)
     affine = np.asarray(image.affine, dtype=float)
     named = image.header.get_xyzt_units()[0] if hasattr(image.header, "get_xyzt_units") else "unknown"
     unit = options.unit_mm or (1.0 if named == "unknown" else unit_length(path.name, named))
@@ -77,12 +85,39 @@ def read_vectors(path: Path, options: ReadOptions) -> tuple[FloatArray, Volume]:
             "(vector, LPS, as ANTs writes it) or 1006 (displacement vector, RAS)"
         )
     vectors = np.asarray(image.dataobj, dtype=float)[:, :, :, 0].transpose(2, 1, 0, 3)
+    _warn_of_contradicting_forms(path, image)
     affine = np.asarray(image.affine, dtype=float)
     named = image.header.get_xyzt_units()[0]
     unit = options.unit_mm or (1.0 if named == "unknown" else unit_length(path.name, named))
     vectors = unit * (vectors @ FLIP_RAS if intent == _DISPLACEMENT else vectors)
     known = np.isfinite(vectors).all(axis=3)
     return vectors, volume_with_axes(path.name, known, FLIP_RAS @ affine[:3, 3], FLIP_RAS @ affine[:3, :3], unit)
+
+
+def _warn_of_contradicting_forms(path: Path, image: Any) -> None:
+    """Warn where sform, which is used, and qform state other sizes of voxels, or another place in the same space.
+
+    Forms of unequal codes may differ in place, as those of the scanner and of an atlas do, but a voxel has one size.
+    """
+    header = image.header
+    if not hasattr(header, "get_qform"):
+        return
+    (sform, code), (qform, other) = header.get_sform(coded=True), header.get_qform(coded=True)
+    if not code or not other:
+        return
+    sizes, others = (np.linalg.norm(form[:3, :3], axis=0) for form in (sform, qform))
+    corners = np.array([[i, j, k, 1] for i in (0, 1) for j in (0, 1) for k in (0, 1)]) * [*np.maximum(np.array(image.shape[:3]) - 1, 1), 1]
+    apart = float(np.linalg.norm(corners @ (sform - qform).T, axis=1).max())
+    scaled = np.abs(sizes / np.maximum(others, 1e-300) - 1.0).max() > _ALIKE
+    if scaled or (code == other and apart > _HALF_VOXEL * float(others.min())):
+        told, qform_told = (" x ".join(f"{size:.4g}" for size in each) for each in (sizes, others))
+        what = f"voxels of {told} and of {qform_told}" if scaled else f"places that are up to {apart:.3g} (unit of the file) apart"
+        warnings.warn(
+            f"{path.name}: its sform (code {int(code)}) and its qform (code {int(other)}) contradict each other: {what}; the sform was "
+            "used. Where it is that of an atlas, or was left from before resampling, set its code to 0, so that the qform is used",
+            ContradictingFormsWarning,
+            stacklevel=4,
+        )
 
 
 def _stored_bytes(path: Path) -> int:

@@ -52,7 +52,8 @@ def import_markers(
     Parameters
     ----------
     path : path-like
-        Text table separated by commas, semicolons or tabs (decimal commas are recognised), or an Excel file (.xlsx).
+        Text table separated by commas, semicolons or tabs (decimal commas are recognised), an Excel file (.xlsx), or points of 3D Slicer
+        (.mrk.json, .fcsv), which are turned from RAS into LPS where the file states RAS.
         Lines above the header are skipped.
     columns : mapping, optional
         Column of each quantity, for example ``{"marker": "No.", "x_mm": "X [mm]", "y_mm": "Y [mm]", "z_mm": "Z [mm]"}``; ``"status"`` and

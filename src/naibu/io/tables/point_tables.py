@@ -38,6 +38,7 @@ _STATUS: tuple[tuple[re.Pattern[str], Callable[[FloatArray], BoolArray]], ...] =
     (re.compile(r"returnStatus|(?:SubPix)?ReturnStat", re.IGNORECASE), lambda status: status == 2),
     (re.compile(r"is[\s_]?valid", re.IGNORECASE), lambda status: status > 0.5),
 )
+_MASK = re.compile(r"mask(?:ed)?", re.IGNORECASE)
 COLUMNS = {axis: _patterns(k, axis, component) for k, (axis, component) in enumerate(zip("xyz", "uvw", strict=True))}
 
 
@@ -119,9 +120,34 @@ def assembled(
         parts[name] = np.column_stack([column(c, unit) for c in some]) if some else None
     status = next(((at, test) for at, name in enumerate(names) for pattern, test in _STATUS if pattern.fullmatch(name.strip())), None)
     valid = None if status is None else np.asarray(status[1](column(status[0], None)))
+    if valid is None and parts["vectors"] is not None:
+        valid = _unmasked(path, names, parts["vectors"], lambda at: column(at, None))
     points = parts["points"]
     assert points is not None
     return PointTable(points, parts["vectors"], parts["sd"], valid, {"zpos", "zdisp"} <= {name.strip().lower() for name in names})
+
+
+def _unmasked(path: Path, names: list[str], vectors: FloatArray, column: Callable[[int], FloatArray]) -> BoolArray | None:
+    """Return which points a column "mask" leaves (n,).
+
+    Some programs mark what is masked, some what is left; they write zeros or blanks where nothing was measured.
+
+    Raises
+    ------
+    InputError
+        The displacements do not tell which of its values is which.
+    """
+    at = next((k for k, name in enumerate(names) if _MASK.fullmatch(_plain(name))), None)
+    if at is None or len(values := np.unique(column(at))) == 1:
+        return None
+    nothing = ~np.isfinite(vectors).all(axis=1) | (vectors == 0.0).all(axis=1)
+    empty = [value for value in values if nothing[column(at) == value].all()]
+    if len(values) != 2 or len(empty) != 1:
+        raise InputError(
+            f"{path}: the column {names[at]!r} does not tell which points were measured: none of its values stands only where "
+            "displacements are 0 or missing; name it isValid, 1 where a point was measured and 0 elsewhere"
+        )
+    return np.asarray(column(at) != empty[0])
 
 
 _WORDS = {"points": "positions", "vectors": "displacements", "sd": "standard deviations"}

@@ -12,6 +12,7 @@ from pathlib import Path
 from naibu.core.arrays import LENGTHS_MM
 from naibu.core.errors import InputError, MissingDependencyError
 from naibu.io.files.reading import read_bytes, require_regular
+from naibu.io.tables import slicer_markups
 
 MM_PER_UNIT = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 1e-3, "µm": 1e-3, "μm": 1e-3, "in": 25.4, "inch": 25.4}
 _UNIT = re.compile(r"(?:[\s_,/]+|[\s_]*[\[(]\s*)(mm|cm|m|um|µm|μm|inch|in)\s*[\])]?$", re.IGNORECASE)
@@ -27,11 +28,16 @@ HEADER_WITHIN = 20
 
 
 def text_rows(path: Path, delimiter: str | None) -> list[tuple[int, list[str]]]:
-    """Return the lines of a text table with their numbers, blank ones left out; by default the delimiter is found."""
+    """Return the lines of a text table with their numbers, blank ones left out; by default the delimiter is found.
+
+    Points that were marked in 3D Slicer are rows in LPS, whatever frame the file states.
+    """
     content = read_bytes(path)
     if b"\0" in content[:4096] and not content.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise InputError(f"{path}: is not a text table; save it as CSV, or as .xlsx")
     text = _decoded(path, content)
+    if slicer_markups.is_markups(path, text):
+        return slicer_markups.rows_of(path, text)
     if delimiter is not None and len(delimiter) != 1:
         raise InputError(f"delimiter = {delimiter!r} must be one character, for example ';'")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter or _delimiter(text))
