@@ -146,7 +146,7 @@ def altered(sensor: Path, *, late_ms: float, offset_n: float) -> None:
 def test_a_late_clock_and_a_sensor_that_was_not_tared_are_estimated_and_told(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
     study, _, sensor = inputs
     altered(sensor, late_ms=8.0, offset_n=-0.3)
-    run = calibrate_study(study, forces=[sensor], out=tmp_path / "out", groups="all")
+    run = calibrate_study(study, forces=[sensor], out=tmp_path / "out", groups="all", sensor_errors="offset and delay")
     low, high = run.estimate.intervals().T
     assert (low < [45.0, 5.0]).all() and (high > [45.0, 5.0]).all()
     told = {error["quantity"]: error for error in json.loads(run.files[1].read_text(encoding="utf-8"))["sensor_errors"]}

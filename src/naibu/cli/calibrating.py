@@ -40,7 +40,7 @@ def calibrate(
     method: Literal["gauss-newton", "cma-es", "genetic"] = "gauss-newton",
     point_sd_mm: float = 0.5,
     force_sd_mn: float | None = None,
-    sensor_errors: Literal["none", "offset", "delay", "offset and delay", "drift", "drift and delay"] = "offset and delay",
+    sensor_errors: Literal["none", "offset", "delay", "offset and delay", "drift", "drift and delay"] = "none",
     max_runs: Whole = 2000,
     seed: Whole = 0,
     threads: Whole = 2,

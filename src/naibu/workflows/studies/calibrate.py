@@ -87,7 +87,7 @@ def calibrate_study(
     method: Method = "gauss-newton",
     point_sd_mm: float = POINT_SD_MM,
     force_sd_mn: float | None = None,
-    sensor_errors: SensorErrorNames = "offset and delay",
+    sensor_errors: SensorErrorNames = "none",
     max_runs: int = 2000,
     seed: int = 0,
     threads: int = 2,
