@@ -46,10 +46,10 @@ def sensor_section(sensors: Sequence[SensorError]) -> tuple[Section, ...]:
         return ()
     rows = tuple((e.body, e.quantity, e.value, e.value - 1.96 * e.sd, e.value + 1.96 * e.sd, e.unit) for e in sensors)
     text = (
-        "Errors of the force sensors were estimated along with the parameters, whose intervals count them. Where a sensor was tared and its "
-        "clock is that of the indenters, sensor_errors = none makes intervals shorter. In contact, with many unknowns, intervals beside "
-        "these errors can be too short: compare with those of none, and rely on the longer ones. A wrong gain of a sensor cannot be told "
-        "from stiffness, nor a slow drift from creep."
+        "Errors of the force sensors were estimated along with the parameters, whose intervals count them. Where a sensor was tared, and "
+        "its clock is that of the indenters, sensor_errors = none makes intervals shorter. In contact, with many unknowns, intervals "
+        "beside these errors can be too short: compare with those of none, and rely on the longer ones. A wrong gain of a sensor cannot "
+        "be told from stiffness, nor a slow drift from creep."
     )
     table = Table("Errors of the force sensors", ("indenter", "error", "estimate", "95 % from", "to", "unit"), rows)
     return (Section("Sensors", (text,), (table,)),)
