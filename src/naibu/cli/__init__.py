@@ -22,7 +22,19 @@ from naibu.cli import (  # noqa: F401  they bring their verbs
 )
 from naibu.cli.installation import doctor_rows, healthy
 from naibu.cli.shell.cold_start import first_run
-from naibu.cli.shell.console import BAD_INPUT, COMMANDS, FAILED, INTERRUPTED, app, errors, fail, print_table, progress_display, say
+from naibu.cli.shell.console import (
+    BAD_INPUT,
+    COMMANDS,
+    FAILED,
+    INTERRUPTED,
+    app,
+    errors,
+    fail,
+    print_table,
+    progress_display,
+    say,
+    told_warnings,
+)
 from naibu.cli.shell.described import Flag
 from naibu.cli.shell.failures import (
     OutputLostError,
@@ -144,7 +156,7 @@ def _run() -> None:
 def main() -> None:
     """Run the command line; a user's mistake ends with one message and exit code 2, any other error with one message and code 1."""
     occupy_closed_streams()
-    with recorded_run(sys.argv[1:]) as run:
+    with recorded_run(sys.argv[1:]) as run, told_warnings():
         try:
             _ended()
             _finish(run, 0)

@@ -1,5 +1,5 @@
 from .chunked_volume import ChunkedVolume
-from .errors import ConvergenceError, InputError, MissingDependencyError, NaibuError, WorkerLostError
+from .errors import ConvergenceError, InputError, MissingDependencyError, NaibuError, NaibuWarning, WorkerLostError
 from .experiment import Layer, Loading, Shape, State
 from .parameters import Parameter, ParameterSet
 from .progress import ProgressReport
@@ -14,6 +14,7 @@ __all__ = [
     "Loading",
     "MissingDependencyError",
     "NaibuError",
+    "NaibuWarning",
     "Parameter",
     "ParameterSet",
     "ProgressReport",

@@ -7,6 +7,10 @@ class NaibuError(Exception):
     """Base class of the errors that naibu raises deliberately; the command line prints them without a traceback."""
 
 
+class NaibuWarning(UserWarning):
+    """Base class of the warnings that naibu gives; the command line prints them in a line each, without the place in the code."""
+
+
 class InputError(NaibuError, ValueError):
     """Invalid data, file or argument."""
 

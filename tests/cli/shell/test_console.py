@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import io
+import warnings
 
 import pytest
 from rich.console import Console
 
 from naibu.cli.shell import console
+from naibu.core.errors import NaibuWarning
 from naibu.core.progress import ProgressReport, report_progress
 
 
@@ -62,3 +64,17 @@ def test_the_time_left_follows_from_the_share_done_since_the_stage_began() -> No
     stages = [("a", 0.2, 10.0), ("a", 0.4, 20.0), ("b", 0.0, 21.0), ("b", None, 22.0), ("b", 0.1, 121.0)]
     told = [left.after(ProgressReport(stage, share, None if share is None else 1.0), now) for stage, share, now in stages]
     assert told == ["", "about 30 s left", "", "", "about 15 min left"]
+
+
+def test_warnings_are_told_without_their_place_in_the_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    out, others = io.StringIO(), []
+    monkeypatch.setattr(console, "console", Console(file=out, width=160, force_terminal=False))
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        monkeypatch.setattr(warnings, "showwarning", lambda message, *_: others.append(str(message)))
+        with console.told_warnings():
+            warnings.warn("a.nii: its forms [0] contradict each other", NaibuWarning, stacklevel=1)
+            warnings.warn("of another package", RuntimeWarning, stacklevel=1)
+        warnings.warn("told outside", NaibuWarning, stacklevel=1)
+    assert out.getvalue() == "a.nii: its forms [0] contradict each other\n"
+    assert others == ["of another package", "told outside"]

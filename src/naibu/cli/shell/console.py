@@ -12,8 +12,9 @@ import io
 import math
 import sys
 import time
+import warnings
 from collections.abc import Callable, Iterator, Sequence
-from typing import IO, NoReturn, cast
+from typing import IO, Any, NoReturn, cast
 
 from cyclopts import App, Group, Parameter
 from rich.console import Console
@@ -30,6 +31,7 @@ from rich.table import Table
 
 from naibu.cli.shell.run_record import current_run
 from naibu.cli.shell.version import version_text
+from naibu.core.errors import NaibuWarning
 from naibu.core.progress import Progress, ProgressReport
 
 COMMANDS = Group("This program", sort_key=90)
@@ -195,6 +197,24 @@ def say(text: str, style: str | None = None) -> None:
         return
     target = errors if run.as_json or run.quiet else console
     target.print(escape(text), style=style, soft_wrap=True, highlight=False)
+
+
+@contextlib.contextmanager
+def told_warnings() -> Iterator[None]:
+    """Within this context, warnings of naibu are printed as lines of their own, and those of other packages as they are."""
+    shown = warnings.showwarning
+
+    def told(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, NaibuWarning):
+            say(str(message), WARNING)
+        else:
+            shown(message, category, *place, **more)
+
+    warnings.showwarning = told
+    try:
+        yield
+    finally:
+        warnings.showwarning = shown
 
 
 def print_table(

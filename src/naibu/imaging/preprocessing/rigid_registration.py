@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
-from naibu.core.errors import InputError
+from naibu.core.errors import InputError, NaibuWarning
 from naibu.core.optional_packages import optional_package
 from naibu.core.rigid_transform import RigidTransform
 from naibu.core.volume import Volume
@@ -27,7 +27,7 @@ FEWEST_VOXELS = 20  # of a part of a mask whose own motion is estimated; empiric
 CORRELATED, SIGNIFICANT = 8.0, 2.0
 
 
-class NotRigidWarning(UserWarning):
+class NotRigidWarning(NaibuWarning):
     """The points or the mask of a rigid registration did not move rigidly."""
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from naibu.core.arrays import AnyArray, FloatArray
-from naibu.core.errors import InputError
+from naibu.core.errors import InputError, NaibuWarning
 from naibu.core.optional_packages import optional_package
 from naibu.core.volume import Volume
 from naibu.io.files.atomic import write_atomically
@@ -25,7 +25,7 @@ _ALIKE, _HALF_VOXEL = 0.01, 0.5  # of sizes of voxels; of one of them, where two
 _STORED = ("u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f4", "f8")
 
 
-class ContradictingFormsWarning(UserWarning):
+class ContradictingFormsWarning(NaibuWarning):
     """The two forms of a header place or scale the voxels differently."""
 
 
