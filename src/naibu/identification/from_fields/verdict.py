@@ -29,7 +29,7 @@ POINTS_OF_CELL, LEAST_POINTS = 2, 0.25
 POINTS_FOR_POISSON = 0.5  # for every cell: with 0.4 Poisson's ratios of 0.45 came out as 0.476, two standard deviations above
 FEW_POINTS = (
     "There are fewer points than elements: they leave the motion of the surface to the assumption that it is smooth, which draws Poisson's "
-    "ratio towards 0.5. Nothing is said of Poisson's ratio; measure more points, or use larger elements, to know more."
+    "ratio towards 0.5. Nothing is said of Poisson's ratio; measure more points to know more."
 )
 BLOCKS, POINTS_PER_BLOCK, FEWEST_BLOCKS = 64, 6, 16
 
@@ -79,8 +79,8 @@ def tells_poisson(model: FieldModel) -> bool:
 
 def told_points(points: int, cells: int) -> str:
     """Say that there are too few points for the number of cells."""
-    ways = "measure more of them, or use larger cells"
-    return f"{points} points for {cells} cells leave to the motion of the surface what would tell moduli: {ways}"
+    # no word of larger cells: where these are too coarse already, that would contradict what is said of them
+    return f"{points} points for {cells} cells leave to the motion of the surface what would tell moduli: measure more of them"
 
 
 def _told_outliers(misfit: FloatArray) -> str:
