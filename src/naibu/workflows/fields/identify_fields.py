@@ -219,14 +219,13 @@ def identify_fields(
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     if check_components:
         require_likely_components(scanned, points, progress)
-    bounds = stated.bounds
     if stated is NOTHING_KNOWN:
-        found = identify_relative_map(cubes.mesh, cubes.load_cases, law=law, bounds=bounds, progress=progress)
+        found = identify_relative_map(cubes.mesh, cubes.load_cases, law=law, bounds=stated.bounds, progress=progress)
     else:
-        found = cubes.identified(stated, law=law, bounds=bounds, each_cell=each_cell, progress=progress)
+        found = cubes.identified(stated, law=law, bounds=stated.bounds, each_cell=each_cell, progress=progress)
         if not (each_cell or element_size_mm):
             cubes, found = identified_on_smaller_cubes(
-                cubes, found, stated, most=min(MOST_REFINED, points // POINTS_OF_CELL), law=law, bounds=bounds, progress=progress
+                cubes, found, stated, most=min(MOST_REFINED, points // POINTS_OF_CELL), law=law, bounds=stated.bounds, progress=progress
             )
     found = told_left_out(found, scanned.covering, given.values)
     inputs = input_record({"mask": mask, "zones": zones} | {f"field {k + 1}": p for k, p in enumerate(paths)})

@@ -167,21 +167,20 @@ def calibrate_study(
     sensors = sensor_errors_found(problem, estimate)
     after = Compared.of(problem, estimate.values)
     settings = calibrated_settings(prepared.settings, estimate)
-    inputs = {**prepared.inputs, **_hashes((*shapes, *forces))}
     options: dict[str, str | float | int | None] = {
         "study": prepared.source, "method": method, "groups": groups, "friction": friction, "point_sd_mm": point_sd_mm, "seed": seed,
         "starts": starts, "sensor_errors": sensor_errors,
-        **{f"SHA-256 of {file}": digest for file, digest in inputs.items()},
+        **{f"SHA-256 of {file}": digest for file, digest in {**prepared.inputs, **_hashes((*shapes, *forces))}.items()},
     }  # fmt: skip
     warnings = (*_warnings_of_starts(several), *sensor_warnings(problem, diagnosis, sensors), *_warnings(problem, estimate, before))
     chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options, several, sensors)
     comment = f"{prepared.title}, calibrated by naibu {__version__} from {', '.join(map(_file_name, (*shapes, *forces)))}"
     target = write_atomically(folder / name, study_document(_with_volumes(prepared, settings, folder), comment))
     page = write_atomically(folder / "calibration.html", chapter_html(chapter))
-    numbers = {**_numbers(estimate), "misfit": misfit_numbers(problem, before, after), "warnings": list(warnings), "settings": options}
-    numbers["sensor_errors"] = [asdict(error) for error in sensors]
-    if several:
-        numbers["starts"] = start_numbers(several)
+    numbers = {
+        **_numbers(estimate), "misfit": misfit_numbers(problem, before, after), "warnings": list(warnings), "settings": options,
+        "sensor_errors": [asdict(error) for error in sensors], **({"starts": start_numbers(several)} if several else {}),
+    }  # fmt: skip
     written = write_atomically(folder / "calibration.json", json.dumps(numbers, indent=1, ensure_ascii=False) + "\n")
     return LatticeCalibration((page, written, target), estimate, warnings)
 

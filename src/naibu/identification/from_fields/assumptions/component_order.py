@@ -27,7 +27,7 @@ from naibu.mechanics.linear_algebra.multigrid import rigid_body_modes
 POISSON_RATIOS = (0.45, 0.49, 0.3, 0.498, 0.0)  # of the homogeneous body, the most usual first
 LEAST_SHARE = 0.15  # of the deformation, by root mean square, that errors of elements and of small strain may leave as well
 LEAST_SD = 2.0  # standard deviations of the measurement
-DECISIVE = 3.0  # times the misfit: of 80 bodies with layers, inclusions and plates of all kinds none left 1.5 times that of another order
+DECISIVE = 3.0  # times the misfit, empirical: bodies with layers, inclusions and plates leave less than 1.5 times that of another order
 MOST_SHARE = 0.3  # of the deformation, that the likeliest may leave: where forces act at sides that are called free, none explains much
 ALIKE = 1.5  # times the least misfit: arrangements within it are as likely
 
