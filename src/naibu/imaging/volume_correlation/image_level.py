@@ -88,7 +88,7 @@ class ImageLevel:
         self.gradient = gradient / self.spacing.astype(np.float32)
         edges = np.diff(np.pad(self.mask.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
         first, last = np.argwhere(edges == 1), np.argwhere(edges == -1)
-        self.runs = np.column_stack([first, last[:, 2], self.number[tuple(first.T)]]).astype(np.int64)
+        self.runs = np.column_stack([first, last[:, 2], self.number[tuple(first.T)]]).astype(np.int64, order="C")
 
     def sample(self, positions_mm: FloatArray, value: Float32Array, gradient: Float32Array) -> None:
         """Fill value (n,) and gradient (n, 3), per voxel, of the deformed volume at positions (n, 3), mm; OUTSIDE beyond its view."""

@@ -213,7 +213,8 @@ def per_cell(value: ArrayLike, n_cells: int, name: str = "a parameter") -> Float
         raise InputError(f"{name} must be one number or one for each of the {n_cells} cells, not an array of shape {given.shape}")
     if not np.isfinite(given).all():
         raise InputError(f"{name} must be finite; cell {int(np.flatnonzero(~np.isfinite(np.atleast_1d(given)))[0])} is not")
-    return np.broadcast_to(given, (n_cells,))
+    # of one kind, whatever is given: kernels are compiled for each kind of array
+    return np.array(np.broadcast_to(given, (n_cells,)))
 
 
 def lumped_mass(body: Simplices, density: ArrayLike) -> FloatArray:

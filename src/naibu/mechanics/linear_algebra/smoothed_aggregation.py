@@ -148,7 +148,7 @@ class Level:
         sizes = (self.zeros, self.of_mode)
         own = np.concatenate([[0], np.cumsum(made.label >= 0)])
         labelled = made.label >= 0
-        t = own, made.label[labelled], made.tentative[labelled]
+        t = own, made.label[labelled].astype(np.int32), made.tentative[labelled]
         p_start, p_columns = made.prolongation
         prolonging = np.empty((len(p_columns), p.d, coarser.d), np.float32)
         chunks.run(aggregation.add_blocks, indptr, indices, self.blocks, *t, p_start, p_columns, prolonging, sizes=sizes)

@@ -343,7 +343,7 @@ def _divided(s, k, r, anywhere, back):  # type: ignore[no-untyped-def]  # pragma
 @njit(cache=True, **UNCOUNTED)
 def advance(s, k, final):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Take one step of the cut; returns what came of it."""
-    whole, distance, free = k.whole, k.real[DISTANCE], k.whole[FREE]
+    whole, distance, free = k.whole, k.real[DISTANCE], k.whole[FREE] != 0  # a truth, as the other arguments of its kind are
     left = k.length[whole[COUNT] - 1] - k.real[AT]
     if not final and left < 2.0 * distance:
         return WAITING

@@ -274,7 +274,7 @@ def refine(forest, k, marked, begin, ring, stack, made, split):  # type: ignore[
 @njit(cache=True)
 def _restorable(cells, k, t, ring, need_marks):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Fill `ring` with the cells that were bisected with t; return their number, or 0 where they cannot be restored."""
-    n = ring_of_edge(cells, k, t, 0, SECOND[cells[t, TAG]], ring)
+    n = ring_of_edge(cells, k, np.int64(t), 0, SECOND[cells[t, TAG]], ring)
     sources = SOURCES_3D if k == 4 else SOURCES_2D
     for r in range(n):
         u = ring[r]

@@ -317,8 +317,8 @@ def propose(
     """
     for t in prange(len(active)):
         _propose_one(
-            t, reference, neighbours, deformed, origin, width, dims, starts, members, scales, active, link, gradients, reach, most, robust,
-            predicted, proposal, distance, fitted,
+            np.int64(t), reference, neighbours, deformed, origin, width, dims, starts, members, scales, active, link, gradients, reach,
+            most, robust, predicted, proposal, distance, fitted,
         )  # fmt: skip
 
 

@@ -127,7 +127,8 @@ def checked_velocity(velocity: ArrayLike, steps: int, bodies: int) -> FloatArray
     given = np.asarray(velocity, dtype=float)
     bodies = max(bodies, given.shape[-2] if given.ndim >= 2 else 0)
     try:
-        path = np.array(np.broadcast_to(given, (steps, bodies, 3)))
+        # in the order of rows, whatever that of what is given: kernels are compiled for each order
+        path = np.array(np.broadcast_to(given, (steps, bodies, 3)), order="C")
     except ValueError:
         raise InputError(
             f"velocities of shape {given.shape} do not fit {steps} steps of {bodies} bodies: give (steps, bodies, 3)"
