@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -35,7 +36,7 @@ from naibu.mechanics.finite_strain.statics import solve
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import side_nodes
-from naibu.workflows.fields.block_mesh import block_mesh, mesh_that_shows, region_in
+from naibu.workflows.fields.block_mesh import ZoneTooThin, block_mesh, mesh_that_shows, region_in
 from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields
 from naibu.workflows.fields.known_zones import parse_known_zones
 from naibu.workflows.fields.object_on_cubes import ObjectOnCubes, ScannedObject, identified_on_smaller_cubes, smaller_size
@@ -198,6 +199,31 @@ def test_cubes_that_do_not_show_a_zone_are_refused_or_made_smaller() -> None:
     mesh, cells = mesh_that_shows(inside, own, names, {"shell"}, 6.0, exactly=False)
     assert 400 < mesh.n_cells < 5000
     assert (mesh.regions[cells[own == 1]] == 0).mean() >= 0.75 and (own[mesh.regions[cells] == 0] == 1).mean() >= 0.75
+
+
+def test_cubes_shrink_in_steps_that_meet_the_borders_of_a_block() -> None:
+    """A block a quarter as wide as the object: cubes of a twelfth of its edge show it exactly, somewhat smaller ones do not."""
+    inside = Volume.from_array(np.ones((40,) * 3, np.uint8), spacing_mm=(1.0,) * 3)
+    numbers = np.ones((40,) * 3, dtype=np.int64)
+    numbers[20:30, 10:20, 20:30] = 2
+    mesh, cells = mesh_that_shows(inside, numbers, {1: "gel", 2: "lump"}, {"lump"}, 3.76, exactly=False)
+    assert mesh.n_cells == 12**3
+    np.testing.assert_array_equal(mesh.regions[cells] == 1, numbers == 2)
+
+
+def test_refusal_of_a_thin_zone_names_the_size_that_shows_it() -> None:
+    inside = Volume.from_array(np.ones((20,) * 3, np.uint8), spacing_mm=(1.0,) * 3)
+    numbers = np.ones((20,) * 3, dtype=np.int64)
+    numbers[9:11, 9:11, 5:15] = 2
+    names = {1: "gel", 2: "wire"}
+    with pytest.raises(ZoneTooThin) as refused:
+        mesh_that_shows(inside, numbers, names, {"wire"}, 4.0, exactly=True)
+    told = re.search(r"element_size_mm ([\d.]+) would do, with (\d+) cells", str(refused.value.with_size(inside, numbers, names, {"wire"})))
+    assert told is not None
+    size, count = float(told[1]), int(told[2])
+    assert mesh_that_shows(inside, numbers, names, {"wire"}, size, exactly=True)[0].n_cells == count
+    coarse = Volume.from_array(np.ones((20,) * 3, np.uint8), spacing_mm=(4.0,) * 3)
+    assert "no element_size_mm would do" in str(refused.value.with_size(coarse, numbers, names, {"wire"}))
 
 
 def scanned_limb() -> ScannedObject:

@@ -26,7 +26,7 @@ BEYOND = "beyond the object"  # region of cells around it, which help to fit oth
 PLANE = 0.5  # part of a section of the object that changes its zone there: cells begin at such a plane
 # part of a zone, or of its cells, that is not the other: with 0.37 a thin skin was found 2 to 7 times too stiff
 LOST = 0.25
-SMALLER, MOST_BY_DEFAULT = 0.85, 5000  # steps of the size of cells, and how many of them are made unasked
+SMALLER, MOST_BY_DEFAULT = 0.95, 5000  # steps of the size of cells, such that borders fall between cells, and how many are made unasked
 NARROWEST = 0.3  # of a cell, in edge lengths, between such planes
 WHOLE_VOXELS = 1.000001  # of a stated edge length: lengths of voxels are rounded in headers
 HALF_FILLED = 0.5  # part of a cell that must lie in the object
@@ -203,12 +203,32 @@ def moved_borders(mesh: Mesh, inside: Volume, labels: IntArray) -> tuple[MovedBo
     return tuple(out)
 
 
-class ZoneTooThin(InputError):
-    """A zone that shares too little with its cubes."""
+NO_SIZE = f"no element_size_mm would do whose cells, at most {MOST_CELLS}, can be computed, and that is no less than the voxels"
 
-    def __init__(self, zone: str, message: str) -> None:
-        super().__init__(message)
-        self.zone = zone
+
+class ZoneTooThin(InputError):
+    """A zone that shares too little with its cubes: `shared` is the part of their volume, and `size_mm` the edge length of the cubes."""
+
+    def __init__(self, zone: str, shared: float, size_mm: float, mend: str = "choose a smaller element_size_mm") -> None:
+        super().__init__(
+            f"zone {zone!r} and its cubes of {size_mm:.3g} mm share only {100 * shared:.0f} % of their volume, too little "
+            f"for its modulus: {mend}, or give the zone the label of its neighbour"
+        )
+        self.zone, self.shared, self.size_mm = zone, shared, size_mm
+
+    def with_size(self, inside: Volume, labels: IntArray, names: Mapping[int, str], sought: Collection[str]) -> ZoneTooThin:
+        """Return the error that names the largest size of cells at which all zones that are sought share enough with theirs."""
+        size = float(f"{SMALLER * self.size_mm:.3g}")
+        while size >= min(inside.spacing_mm):
+            try:
+                mesh, _ = mesh_that_shows(inside, labels, names, sought, size, exactly=True)
+            except ZoneTooThin:
+                size = float(f"{SMALLER * size:.3g}")
+            except InputError:  # too many cells
+                break
+            else:
+                return ZoneTooThin(self.zone, self.shared, self.size_mm, f"element_size_mm {size:g} would do, with {_within(mesh)} cells")
+        return ZoneTooThin(self.zone, self.shared, self.size_mm, NO_SIZE)
 
 
 def mesh_that_shows(
@@ -242,22 +262,26 @@ def mesh_that_shows(
     size = element_size_mm
     while True:
         mesh, cells = block_mesh(inside, labels, names, size)
-        given, there = np.where(cells >= 0, np.array(sorted(names))[mesh.regions[cells]], -1), inside.values != 0
-        lost = {}
-        for label, name in names.items():
-            if name in sought:
-                zone, own = there & (labels == label), given == label
-                lost[name] = 1.0 - float((zone & own).sum() / max(zone.sum(), own.sum()))
+        lost = _lost(mesh, cells, inside, labels, names, sought)
         worst = max(lost, key=lambda name: lost[name], default="")
         if not lost or lost[worst] <= LOST:
             return mesh, cells
         if exactly or _within(mesh) > most * SMALLER**3 or size <= min(inside.spacing_mm):
-            raise ZoneTooThin(
-                worst,
-                f"zone {worst!r} and its cubes of {size:.3g} mm share only {100 * (1.0 - lost[worst]):.0f} % of their volume, too little "
-                "for its modulus: choose a smaller element_size_mm, or give the zone the label of its neighbour",
-            )
+            raise ZoneTooThin(worst, 1.0 - lost[worst], size)
         size *= SMALLER
+
+
+def _lost(
+    mesh: Mesh, cells: IntArray, inside: Volume, labels: IntArray, names: Mapping[int, str], sought: Collection[str]
+) -> dict[str, float]:
+    """Return which part of every zone that is sought, or of its cells, is not the other."""
+    given, there = np.where(cells >= 0, np.array(sorted(names))[mesh.regions[cells]], -1), inside.values != 0
+    lost = {}
+    for label, name in names.items():
+        if name in sought:
+            zone, own = there & (labels == label), given == label
+            lost[name] = 1.0 - float((zone & own).sum() / max(zone.sum(), own.sum()))
+    return lost
 
 
 def _within(mesh: Mesh) -> int:

@@ -97,7 +97,7 @@ def without_thin_coverings(
                 if error.zone in stated:
                     stated.remove(error.zone)
                 elif exactly or most == MOST_BY_DEFAULT:
-                    raise
+                    raise error.with_size(left, labels, of_left, wanted) from None
                 else:
                     most = MOST_BY_DEFAULT
                 continue
