@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 
 from naibu.core.errors import InputError
+from naibu.core.volume import Volume
 from naibu.imaging.large_volumes.block_sums import compared_block
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.textured_sphere import squeezed_ball
 from naibu.workflows.measurement import block_checkpoint
+from naibu.workflows.measurement.sense import sense
 from naibu.workflows.measurement.sense_blocks import CHECKPOINT, MemoryPlan, sense_blocks
 from naibu.workflows.parallel import local_worker
 from naibu.workflows.parallel.frames import write_frame
@@ -134,3 +136,30 @@ def test_blocks_of_other_code_are_not_resumed(pair: tuple[Path, Path], tmp_path:
     monkeypatch.setattr(block_checkpoint, "_digest_of_code", lambda: "of an earlier program")
     with pytest.raises(InputError, match="another version of naibu"):
         sense_blocks(*pair, out=tmp_path / "out", plan=PLAN, resume=True)
+
+
+def test_a_deformed_scan_on_another_grid_is_resampled_by_blocks_as_in_memory(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    after = read_volume(pair[1])
+    cropped = Volume(after.values[2:, 1:, :-2].copy(), after.spacing_mm, after.to_physical([0, 1, 2]), after.direction)
+    moved = write_volume(tmp_path / "cropped.zarr", cropped)
+    mask = write_volume(tmp_path / "mask.zarr", cropped.with_values(np.ones(cropped.shape, dtype=np.uint8)))
+    run = sense_blocks(pair[0], moved, deformed_mask=mask, out=tmp_path / "blocks", plan=PLAN)
+    assert any("another grid" in warning for warning in run.measured.warnings)
+    there = sense(pair[0], moved, deformed_mask=mask)
+    by_blocks, in_memory = results(tmp_path / "blocks")[0], there.measured.displacement.vectors
+    answered = np.isfinite(in_memory)
+    assert np.isfinite(by_blocks[answered]).mean() > 0.99
+    assert np.nanmean(np.abs(by_blocks - in_memory)[answered]) < 0.02 * after.spacing_mm.min()
+
+
+def test_masks_beside_the_deformed_grid_and_contradicting_grids_are_refused_before_anything_is_written(
+    pair: tuple[Path, Path], tmp_path: Path
+) -> None:
+    after = read_volume(pair[1])
+    other = Volume(after.values[2:], after.spacing_mm, after.origin_mm, after.direction)
+    with pytest.raises(InputError, match="deformed_mask does not lie on the grid of deformed"):
+        sense_blocks(*pair, deformed_mask=write_volume(tmp_path / "mask.zarr", other), out=tmp_path / "out", plan=PLAN)
+    coarser = write_volume(tmp_path / "coarser.zarr", Volume(after.values, 1.1 * after.spacing_mm, after.origin_mm, after.direction))
+    with pytest.raises(InputError, match="as many voxels, but"):
+        sense_blocks(pair[0], coarser, out=tmp_path / "out", plan=PLAN)
+    assert not (tmp_path / "out").exists()

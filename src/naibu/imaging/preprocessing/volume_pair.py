@@ -10,6 +10,7 @@ from naibu.core.volume import NEARLY, Volume
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.resampling import covered, on_voxels_of
 
+PLANES = 128  # along every axis, whose crossings tell which part of a volume lies inside of another
 LOST_SHARE = 0.005  # of the reference's voxels, from which the part outside of the deformed scan is told
 
 
@@ -72,7 +73,19 @@ def on_reference_grid(reference: Volume, deformed: Volume) -> tuple[Volume, str]
     deformed : Volume
         NaN where a voxel lies outside of the deformed volume; itself where it is on the grid of the reference.
     told : str
-        What distinguishes the grids, and what was done; empty for one grid.
+        See `other_grid`.
+
+    Raises
+    ------
+    InputError
+        As `other_grid`.
+    """
+    told = other_grid(reference, deformed)
+    return (on_voxels_of(deformed, reference) if told else deformed), told
+
+
+def other_grid(reference: Volume, deformed: Volume) -> str:
+    """Say what distinguishes the grid of the deformed volume from that of the reference, and what is done; nothing for one grid.
 
     Raises
     ------
@@ -82,7 +95,7 @@ def on_reference_grid(reference: Volume, deformed: Volume) -> tuple[Volume, str]
     """
     different = reference.grid_difference(deformed)
     if not different:
-        return deformed, ""
+        return ""
     ratio = deformed.spacing_mm / reference.spacing_mm
     parallel = np.abs(reference.direction - deformed.direction).max() < NEARLY
     if parallel and reference.shape == deformed.shape and np.abs(ratio - 1.0).max() > NEARLY and not _power_of_ten(ratio):
@@ -92,13 +105,22 @@ def on_reference_grid(reference: Volume, deformed: Volume) -> tuple[Volume, str]
         )
     if _power_of_ten(ratio):
         require_one_grid(reference, deformed)
-    moved = on_voxels_of(deformed, reference)
-    outside = 1.0 - float(covered(deformed, reference).mean())
+    outside = _outside(reference, deformed)
+    if outside == 1.0:
+        raise InputError("volume and grid do not overlap: no voxel of the grid lies inside the volume; check their origins and units")
     lost = f"; {100.0 * outside:.0f} % of its voxels lie outside of the deformed scan" if outside > LOST_SHARE else ""
-    return moved, (
+    return (
         f"the deformed scan lies on another grid ({different}): it was resampled to the grid of the reference by the positions that both "
         f"files state{lost}. If one of them states a wrong position, all displacements are wrong by the same shift"
     )
+
+
+def _outside(reference: Volume, deformed: Volume) -> float:
+    """Return which part of the voxels of the reference, those of evenly spread planes, lies outside of the deformed volume."""
+    count = np.minimum(reference.shape, PLANES)
+    step = (np.array(reference.shape) - 1) / np.maximum(count - 1, 1)
+    spread = Volume(np.broadcast_to(np.False_, count), reference.spacing_mm * step[::-1], reference.origin_mm, reference.direction)
+    return 1.0 - float(covered(deformed, spread).mean())
 
 
 def require_contrast(volume: Volume, name: str) -> None:

@@ -121,6 +121,10 @@ class BlockCheckpoint:
         write_atomically(head, whole)
         return plan
 
+    def with_deformed(self, deformed: StoredVolume) -> BlockCheckpoint:
+        """Return the same, with blocks of another deformed volume."""
+        return BlockCheckpoint(self.folder, (self._pair[0], deformed, self._pair[2]), self._workers, self._memory_mb, self._progress)
+
     def kept(self, name: str, compute: Callable[[], T]) -> T:
         """Return what was kept under a name, or compute it and keep it; the blocks of that name are then no longer needed."""
         path = self.folder / f"{name}.npz"

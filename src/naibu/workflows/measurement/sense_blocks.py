@@ -19,9 +19,11 @@ from naibu.core.progress import Progress, report_progress
 from naibu.imaging.displacement.chunked_strain import COMPONENTS, ChunkedStrain
 from naibu.imaging.large_volumes.correlate_blocks import EDGE, BlockwiseCorrelation, correlate_blocks
 from naibu.imaging.large_volumes.field_blocks import VoxelField, boxes_of
+from naibu.imaging.large_volumes.resampled_blocks import resampled_box
 from naibu.imaging.large_volumes.thinning import BASE_MB, BYTES_PER_VOXEL, COARSE_VOXELS, needed_memory_mb, thinning_factor
 from naibu.imaging.measure_displacement import measured_by
 from naibu.imaging.preprocessing.field_of_view import Box
+from naibu.imaging.preprocessing.volume_pair import other_grid
 from naibu.io.files.provenance import input_record
 from naibu.io.image_formats.ome_zarr import write_levels
 from naibu.io.image_formats.zarr_store import create_chunked, open_array
@@ -39,6 +41,7 @@ BLOCK_BYTES = 250.0  # a voxel of a block
 LEAST_EDGE = 32
 WRITTEN_EDGE = 128  # voxels along a box of results, a multiple of the edge of a chunk
 FEWEST = 40**3  # coarse voxels
+HALF = 0.5  # from which an interpolated voxel belongs to a mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +136,8 @@ def sense_blocks(
     Parameters
     ----------
     reference, deformed : path-like
-        Volumes before and after the deformation, on one grid: Zarr, OME-Zarr, HDF5 and TIFF stacks are read in parts, others whole.
+        Volumes before and after the deformation: Zarr, OME-Zarr, HDF5 and TIFF stacks are read in parts, others whole. A deformed volume
+        on another grid is resampled to that of the reference first, on disk, and a warning says so.
     mask, deformed_mask, check_points, spacing_mm
         As `naibu.sense`.
     out : path-like
@@ -168,6 +172,7 @@ def sense_blocks(
     stored = {role: None if path is None else _stored(path, spacing_mm) for role, path in paths.items()}
     opened = {role: None if volume is None else volume.opened() for role, volume in stored.items()}
     a, b = _required(opened["reference"]), _required(opened["deformed"])
+    told = _told_grids(a, b, opened["deformed_mask"])
     plan = plan or MemoryPlan.of(a.shape, None, max(1, workers))
     points = None if check_points is None else common_points(*check_points)
     kept = BlockCheckpoint(
@@ -177,22 +182,66 @@ def sense_blocks(
     folder = output_folder(out, () if resume else (*FILES, *STORES, *(LEVELS if multiscale else ())), overwrite=overwrite)
     of = {role: _identity(path, opened[role]) for role, path in paths.items() if path is not None}
     used = kept.begin(of, {"factor": plan.factor, "edge": plan.edge}, resume=resume, overwrite=overwrite)
+    scans = b, opened["deformed_mask"]
+    if told:
+        kept, scans = _on_reference_grid(kept, a, *scans)
     try:
-        found = correlate_blocks(a, b, mask=opened["mask"], deformed_mask=opened["deformed_mask"], **used, runner=kept, progress=progress)
+        found = correlate_blocks(a, scans[0], mask=opened["mask"], deformed_mask=scans[1], **used, runner=kept, progress=progress)
     except InputError:
         kept.forget()
         raise
     stores = _written(found, a, kept, folder)
     report_progress(progress, "page and figures")
     inputs = input_record({role: path for role, path in paths.items() if path is not None})
-    pair = Pair(*found.coarse, found.frame.mask, inputs, (Path(reference).name, Path(deformed).name), None, points)
+    notes = (told,) if told else ()
+    pair = Pair(*found.coarse, found.frame.mask, inputs, (Path(reference).name, Path(deformed).name), None, points, notes=notes)
     measured = measured_by(found.result, found.coarse[0], found.frame.mask)
     facts = measured.facts | {"coarse_factor": found.frame.factor, "blocks": found.blocks, "passes": found.passes}
-    run = recorded(pair, replace(measured, facts=facts), time.perf_counter() - began, folder)
+    run = recorded(pair, replace(measured, facts=facts, warnings=(*notes, *measured.warnings)), time.perf_counter() - began, folder)
     if multiscale:
-        stores += _multiscale((a, b), folder)
+        stores += _multiscale((a, scans[0]), folder)
     kept.remove()
     return replace(run, files=(*run.files, *stores))
+
+
+def _told_grids(reference: ChunkedVolume, deformed: ChunkedVolume, deformed_mask: ChunkedVolume | None) -> str:
+    """Say on what grid the deformed volume lies, if not on that of the reference; the mask must lie there, too."""
+    if deformed_mask is not None and (different := deformed.grid.grid_difference(deformed_mask.grid)):
+        raise InputError(f"deformed_mask does not lie on the grid of deformed: {different}; resample it to that grid")
+    return other_grid(reference.grid, deformed.grid)
+
+
+def write_resampled(reference: ChunkedVolume, deformed: ChunkedVolume, mask: ChunkedVolume | None, path: Path, box: Box) -> None:
+    """Write the deformed volume at the voxels (z, y, x) of a box of the reference to a store."""
+    del mask  # that of the reference
+    open_array(path)[box] = resampled_box(deformed, reference, box)
+
+
+def _on_reference_grid(
+    kept: BlockCheckpoint, reference: ChunkedVolume, deformed: ChunkedVolume, deformed_mask: ChunkedVolume | None
+) -> tuple[BlockCheckpoint, tuple[ChunkedVolume, ChunkedVolume | None]]:
+    """Return the checkpoint with the deformed volume at the voxels of the reference, resampled on disk, that volume, and its mask."""
+    volume, mask = kept.folder / "deformed.zarr", kept.folder / "deformed_mask.zarr"
+
+    def created() -> bool:
+        create_chunked(volume, reference)
+        create_chunked(mask, reference, dtype=np.uint8)
+        return True
+
+    kept.kept("grid", created)
+    boxes = boxes_of(reference.shape, WRITTEN_EDGE)
+    kept.kept("resampled", lambda: sum(1 for _ in kept.each("resampled", write_resampled, (volume,), boxes)))
+    moved = StoredVolume(str(volume))
+    if deformed_mask is None:
+        return kept.with_deformed(moved), (moved.opened(), None)
+
+    def written() -> bool:
+        for box in boxes:
+            open_array(mask)[box] = resampled_box(deformed_mask, reference, box) > HALF  # false where it is not a number
+        return True
+
+    kept.kept("resampled mask", written)
+    return kept.with_deformed(moved), (moved.opened(), StoredVolume(str(mask)).opened())
 
 
 def write_box(
