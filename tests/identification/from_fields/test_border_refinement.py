@@ -16,7 +16,7 @@ from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, first_point, search
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph
-from naibu.identification.from_fields.mesh_error import ModuliOn, changes_on_finer_mesh
+from naibu.identification.from_fields.mesh_error import KeptStates, ModuliOn, changes_on_finer_mesh
 from naibu.identification.from_fields.regions import border_refinement, segmentation
 from naibu.identification.from_fields.regions.border_refinement import (
     RefinedRegions,
@@ -282,8 +282,8 @@ def test_residuals_after_a_correction_that_was_taken_back_are_those_before_it(mo
     found = refined_borders(again, zones, replace(start, theta=theta), Bounds())
     seen: list[np.ndarray] = []
 
-    def worse_next(at: Linearised, law: LawName, moduli_on: ModuliOn) -> tuple[list[np.ndarray], LawName] | None:
-        told = changes_on_finer_mesh(at, law, moduli_on)
+    def worse_next(at: Linearised, law: LawName, moduli_on: ModuliOn, kept: KeptStates) -> tuple[list[np.ndarray], LawName] | None:
+        told = changes_on_finer_mesh(at, law, moduli_on, kept)
         assert told is not None
         (change,), of = told
         seen.append(at.model.observed[0].residual(at.point.states[0]) + change)

@@ -27,7 +27,7 @@ from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOL
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, search
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph, cell_volumes
-from naibu.identification.from_fields.mesh_error import DOUBT, DOUBT_OF_RATIO, changes_on_finer_mesh, refitted
+from naibu.identification.from_fields.mesh_error import DOUBT, DOUBT_OF_RATIO, KeptStates, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
 from naibu.identification.from_fields.regions.compressibility import no_less_compressible
 from naibu.identification.from_fields.regions.contrast_prior import BorderPrior, moderated
@@ -305,10 +305,10 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     prior = _prior(mixing)
     residuals, of_before = tuple[FloatArray, ...](), tuple[FloatArray, ...]()
     converged, before, least, of_law = False, here, np.inf, True
-    undone = np.zeros(n)
+    undone, kept = np.zeros(n), KeptStates()
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
-        finer = changes_on_finer_mesh(at, law if of_law else "linear", now.moduli_on)  # no equilibrium once, none later
+        finer = changes_on_finer_mesh(at, law if of_law else "linear", now.moduli_on, kept)  # no equilibrium once, none later
         if finer is None:
             return None
         changes, of_law = finer[0], finer[1] == law
