@@ -134,9 +134,8 @@ def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, 
 
 
 def _released(model: FieldModel, found: RefinedRegions, bounds: Bounds) -> RefinedRegions:
-    """Return the fit of regions and borders within other bounds."""
-    point = model.evaluate(found.point.theta, found.point.states)
-    start = _Trial(found.theta, found.borders.moves.ravel(), point, found.objective)
+    """Return the fit of regions and borders within other bounds: errors are those about a best fit."""
+    start = _Trial(found.theta, found.borders.moves.ravel(), found.point, found.objective)
     return replace(_with_covariance(model, found.mixing, _descended(model, found.mixing, start, bounds)), apart=found.apart)
 
 
