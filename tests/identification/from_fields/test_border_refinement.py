@@ -16,7 +16,7 @@ from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point, logarithms, moduli_of, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, first_point, search
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph
-from naibu.identification.from_fields.mesh_error import ModuliOn, changes_on_finer_mesh
+from naibu.identification.from_fields.mesh_error import KeptStates, ModuliOn, changes_on_finer_mesh
 from naibu.identification.from_fields.regions import border_refinement, segmentation
 from naibu.identification.from_fields.regions.border_refinement import (
     RefinedRegions,
@@ -26,12 +26,14 @@ from naibu.identification.from_fields.regions.border_refinement import (
     without_errors_of_cells,
 )
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
+from naibu.identification.from_fields.regions.compressibility import no_less_compressible
 from naibu.identification.from_fields.regions.merging import merged
 from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined, segment, weight_of_borders
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_nodes
+from naibu.reproduction.chapter3.bodies import LAYERS, cube
 
 SIDE_MM, RADIUS_MM = 30.0, 7.5
 SD_MM = 0.01
@@ -188,6 +190,18 @@ def test_a_soft_lump_of_which_the_map_shows_the_core_is_found_whole(monkeypatch:
     assert young_and_poisson(found.point.theta)[0] == pytest.approx([5.0, 1.0], rel=0.2)
 
 
+def test_poisson_ratio_goes_no_higher_while_regions_are_sought_if_the_surface_is() -> None:
+    """Only there noise draws it towards 0.5."""
+    fields, _ = model()
+    theta = logarithms(*np.array([lame_parameters(5.0, nu) for nu in (0.3, 0.45)]).T)
+    stated = Bounds(poisson_ratio=(0.1, 0.47))
+    assert no_less_compressible(fields, theta, stated).poisson_ratio == pytest.approx((0.1, 0.45))
+    assert no_less_compressible(fields, theta, Bounds(poisson_ratio=(0.1, 0.4))).poisson_ratio == (0.1, 0.4)
+    between_plates = cube(LAYERS)
+    held = FieldModel(between_plates.mesh, between_plates.load_cases(sd_mm=0.1), between_plates.zones(), elements="as_given")
+    assert no_less_compressible(held, theta, stated) == stated
+
+
 def _two_lumps(*radii_mm: float) -> tuple[FieldModel, np.ndarray]:
     """Return the block, and 1 and 2 in balls on its left and right for each of its zones, 0 around them."""
     fields, _ = model()
@@ -268,8 +282,8 @@ def test_residuals_after_a_correction_that_was_taken_back_are_those_before_it(mo
     found = refined_borders(again, zones, replace(start, theta=theta), Bounds())
     seen: list[np.ndarray] = []
 
-    def worse_next(at: Linearised, law: LawName, moduli_on: ModuliOn) -> tuple[list[np.ndarray], LawName] | None:
-        told = changes_on_finer_mesh(at, law, moduli_on)
+    def worse_next(at: Linearised, law: LawName, moduli_on: ModuliOn, kept: KeptStates) -> tuple[list[np.ndarray], LawName] | None:
+        told = changes_on_finer_mesh(at, law, moduli_on, kept)
         assert told is not None
         (change,), of = told
         seen.append(at.model.observed[0].residual(at.point.states[0]) + change)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -13,13 +15,14 @@ from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.forward import forward_model
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, logarithms, moduli_of
-from naibu.identification.from_fields.mesh_error import DOUBT, at_least_to, carried_over, changes_on_finer_mesh, doubt_in_all
+from naibu.identification.from_fields.mesh_error import DOUBT, KeptStates, at_least_to, carried_over, changes_on_finer_mesh, doubt_in_all
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters, material
 from naibu.mechanics.finite_strain.problem import Problem, SolverSettings
 from naibu.mechanics.finite_strain.statics import solve
+from naibu.mechanics.linear_algebra.protocols import Factorization
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.primitives import box
 from naibu.reproduction.chapter3.bodies import LAYERS, cube
@@ -70,6 +73,29 @@ def test_what_half_the_size_changes_is_that_of_an_equilibrium_reached_from_rest(
     there = solve(problem, settings=SolverSettings(first_step=0.05, largest_step=0.1, tolerance=1e-8)).displacement
     expected = (interpolation_operator(fine, points) @ there - interpolation_operator(mesh, points) @ state) / 0.1
     np.testing.assert_allclose(found[0][0].reshape(-1, 3), expected, atol=1e-3 * np.abs(expected).max())
+
+
+def test_states_that_are_kept_spare_most_of_the_way_and_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    at, theta, _ = rough_limb(10.0, 0.0)
+    softer = theta - np.array([0.05, 0.1, 0.0, 0.0])
+    made, factorized = [0], forward_model.Solvers.factorized
+
+    def counted(self: forward_model.Solvers, *arguments: Any) -> Factorization:
+        made[0] += 1
+        return factorized(self, *arguments)
+
+    monkeypatch.setattr(forward_model.Solvers, "factorized", counted)
+    anew = changes_on_finer_mesh(at, "neo_hookean", lambda _, of: moduli_of(of, softer))
+    of_new, kept = made[0], KeptStates()
+    assert changes_on_finer_mesh(at, "neo_hookean", lambda _, of: moduli_of(of, theta), kept) is not None
+    made[0] = 0
+    found = changes_on_finer_mesh(at, "neo_hookean", lambda _, of: moduli_of(of, softer), kept)
+    assert anew is not None and found is not None and made[0] <= 0.6 * of_new
+    np.testing.assert_allclose(found[0][0], anew[0][0], atol=1e-5 * np.abs(anew[0][0]).max())
+    kept.added = {key: 1e3 * added for key, added in kept.added.items()}  # no equilibrium is near that
+    found = changes_on_finer_mesh(at, "neo_hookean", lambda _, of: moduli_of(of, softer), kept)
+    assert found is not None and found[1] == "neo_hookean"
+    np.testing.assert_allclose(found[0][0], anew[0][0], atol=1e-5 * np.abs(anew[0][0]).max())
 
 
 def test_a_large_body_does_not_go_the_long_way_from_rest(monkeypatch: pytest.MonkeyPatch) -> None:

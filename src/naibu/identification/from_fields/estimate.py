@@ -55,7 +55,14 @@ from naibu.identification.from_fields.regions.border_refinement import (
     refined_regions,
     without_errors_of_cells,
 )
-from naibu.identification.from_fields.regions.segmentation import EXPLICIT, Segmentation, fitted_nearby, segment, weight_of_borders
+from naibu.identification.from_fields.regions.segmentation import (
+    EXPLICIT,
+    Segmentation,
+    fitted_nearby,
+    point_at,
+    segment,
+    weight_of_borders,
+)
 from naibu.identification.from_fields.uncertainty import resolution, resolution_report
 from naibu.identification.from_fields.verdict_within_cells import told_alike
 from naibu.identification.load_case import require_load_cases
@@ -338,7 +345,11 @@ class _Recipe:
             return self._with_borders(fewer, graph)
         refined = refined if corrected is None else corrected.refined
         model = self.model.with_zones(refined.zones)
-        fitted = fitted_nearby(model, model.evaluate(refined.theta, refined.point.states), self.bounds, self.progress)
+        try:
+            fitted = fitted_nearby(model, point_at(model, refined.theta, refined.point), self.bounds, self.progress)
+        except ConvergenceError:
+            self.record("no equilibrium was found with the regions as whole cells: borders on faces of cells are kept")
+            return self._sharp(regions.zones, self._fitted(regions), None)
         if corrected is not None:
             return self._estimate(model, model.evaluate(fitted.theta, fitted.states), Status.CONVERGED, refined, corrected)
         return self._sharp(refined.zones, fitted, refined)

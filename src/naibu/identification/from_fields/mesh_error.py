@@ -10,7 +10,7 @@ about 1.8. What extrapolation adds is doubted accordingly.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.sparse as sp
@@ -197,10 +197,20 @@ def change_of_fit(at: Linearised, quadratic: Concentrated, changes: list[FloatAr
     return np.asarray(refitted(at, quadratic, changes).theta + back)
 
 
-def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> tuple[list[FloatArray], LawName] | None:
+@dataclass(slots=True, eq=False)
+class KeptStates:
+    """What equilibrium on the finer mesh added to displacements (n_fine, d), mm, that larger cells lend, by load case and law."""
+
+    added: dict[tuple[int, LawName], FloatArray] = field(default_factory=dict)
+
+
+def changes_on_finer_mesh(
+    at: Linearised, law: LawName, moduli_on: ModuliOn, kept: KeptStates | None = None
+) -> tuple[list[FloatArray], LawName] | None:
     """Return by how much the whitened residuals (q,) of every load case change on a mesh of half the element size, and under which law.
 
-    `moduli_on` gives the moduli of its cells, which are not those of the coarse ones where borders run through these.
+    `moduli_on` gives the moduli of its cells, which are not those of the coarse ones where borders run through these. Where a search comes
+    back with moduli and a surface near by, states that are `kept` spare most of the way to equilibrium.
     Where no equilibrium at finite strain is found on it, because the displacement of the loaded nodes is too rough for small cells or the
     path there from rest too long, the change is that of small strain. Its error for shear moduli of virtual legs was as large as itself.
     None where the elements are used as given, or the finer mesh is too large.
@@ -211,7 +221,7 @@ def changes_on_finer_mesh(at: Linearised, law: LawName, moduli_on: ModuliOn) -> 
     names: tuple[LawName, ...] = ("linear",) if law == "linear" else (law, "linear")
     for name in names:
         try:
-            return _changes(at, name, at.point.states if name == law else _small_strain(at), moduli_on), name
+            return _changes(at, name, at.point.states if name == law else _small_strain(at), moduli_on, kept or KeptStates()), name
         except ConvergenceError:
             continue
     return None
@@ -262,15 +272,27 @@ def _small_strain(at: Linearised) -> tuple[FloatArray, ...]:
     return tuple(equilibrium(law, solvers, lame, shear, o.load_case, u, b"")[0] for o, u in pairs)
 
 
-def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...], moduli_on: ModuliOn) -> list[FloatArray]:
+def _changes(at: Linearised, law: LawName, states: tuple[FloatArray, ...], moduli_on: ModuliOn, kept: KeptStates) -> list[FloatArray]:
     finer = _Finer.of(at, moduli_on)
     body = field_law(finer.computed, law, averaged=finer.averaged)
     solvers, out = Solvers(body, finer.computed.points, iterative=True), []
-    for o, u in zip(at.model.observed, states, strict=True):
+    for t, (o, u) in enumerate(zip(at.model.observed, states, strict=True)):
         on = finer.observed(o)
-        state = settled(body, solvers, finer.computed.points, finer.lame, finer.shear, on.load_case, finer.guess(on, u))
+        lent = finer.guess(on, u)
+        state = _settled_near(finer, body, solvers, on, lent, kept.added.get((t, law)))
+        kept.added[t, law] = state - lent
         out.append(on.residual(state) - o.residual(u))
     return out
+
+
+def _settled_near(finer: _Finer, body: FieldLaw, solvers: Solvers, on: Observed, lent: FloatArray, added: FloatArray | None) -> FloatArray:
+    """Return the displacement (n_fine, d), mm, in equilibrium, sought from one `lent` by larger cells with what was `added` before."""
+    if added is not None:
+        try:
+            return equilibrium(body, solvers, finer.lame, finer.shear, on.load_case, lent + added, b"")[0]
+        except ConvergenceError:  # it does not suit these moduli, or this surface
+            pass
+    return settled(body, solvers, finer.computed.points, finer.lame, finer.shear, on.load_case, lent)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
 from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
-from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
 from naibu.identification.from_fields.inversion.regularization import Regularization
 
 LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
@@ -156,6 +156,8 @@ class Step:
         By how many of their own, together, it moves the moduli; infinite where that is not known.
     response : list of ndarray, shape (n_b, 2 count), or None
         By how much the loaded components follow each modulus, with a minus sign, mm; None where that was not found.
+    renewed : callable or None
+        Finds the step at the same place with a Hessian made there, where that of this one was made elsewhere.
     """
 
     theta: FloatArray
@@ -163,6 +165,7 @@ class Step:
     promise: float
     standard_deviations: float = np.inf
     response: list[FloatArray] | None = None
+    renewed: Callable[[Linearised, Objective], Step] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -207,8 +210,18 @@ def first_point(model: FieldModel, theta: FloatArray) -> Point:
 
 def exact_step(at: Linearised, objective: Objective, near: list[FloatArray] | None = None) -> Step:
     """Return the Gauss-Newton step from the explicit Hessian of all moduli, the loaded components eliminated; `near` is a response."""
+    return step_of(at, objective, at.concentrated(np.eye(len(at.point.theta)), ROUGH_TOLERANCE, near))
+
+
+def step_of(at: Linearised, objective: Objective, data: Concentrated) -> Step:
+    """Return the step that lowers the objective most if half the misfit is a quadratic in all moduli.
+
+    Raises
+    ------
+    ConvergenceError
+        The data do not determine some moduli.
+    """
     theta = at.point.theta
-    data = at.concentrated(np.eye(len(theta)), ROUGH_TOLERANCE, near)
     hessian = data.hessian + objective.curvature(theta).toarray()
     hessian[np.diag_indices_from(hessian)] += ANCHOR * float(np.diag(hessian).max())
     gradient = data.gradient + objective.slope(theta)
@@ -264,6 +277,10 @@ def search(
         if chosen.ended(step, value):
             return Found(point, value, Status.CONVERGED, iteration, near)
         found = _line_search(at, step, objective, value)
+        if found is None and step.renewed is not None:
+            at = model.linearised(model.evaluate(point.theta, point.states))
+            step = step.renewed(at, objective)
+            near, found = step.response, _line_search(at, step, objective, value)
         if found is None:
             return Found(model.evaluate(point.theta, point.states), value, Status.CONVERGED, iteration, near)
         point, value = found

@@ -27,8 +27,9 @@ from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOL
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, search
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph, cell_volumes
-from naibu.identification.from_fields.mesh_error import DOUBT, DOUBT_OF_RATIO, changes_on_finer_mesh, refitted
+from naibu.identification.from_fields.mesh_error import DOUBT, DOUBT_OF_RATIO, KeptStates, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.regions.borders import Borders, Mixing
+from naibu.identification.from_fields.regions.compressibility import no_less_compressible
 from naibu.identification.from_fields.regions.contrast_prior import BorderPrior, moderated
 from naibu.identification.from_fields.regions.segmentation import Segmentation, areas_between, joined
 
@@ -114,13 +115,14 @@ def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, 
     """
     of_moduli, of_location = float(np.log(model.n_free)), float(np.log(graph.count))
     labels = pieces = regions.of_zone
-    best = refined_borders(model, regions.zones, regions.point, bounds)
+    within = no_less_compressible(model, regions.point.theta, bounds)
+    best = refined_borders(model, regions.zones, regions.point, within)
     while best.zones.count > 2:
         trials: list[tuple[float, IntArray, IntArray, RefinedRegions]] = []
-        for a, b, one in _of_one_material(model, best, bounds):
+        for a, b, one in _of_one_material(model, best, within):
             as_one = np.where(labels == b, a, labels)
             trials.append((one.objective - of_moduli, as_one - (as_one > b), pieces, one))
-        for new, of_pieces, one in _within_one_border(model, graph, regions.point, (labels, pieces), best, bounds):
+        for new, of_pieces, one in _within_one_border(model, graph, regions.point, (labels, pieces), best, within):
             trials.append((one.objective - of_moduli - of_location, new, of_pieces, one))
         if not trials:
             break
@@ -128,7 +130,13 @@ def refined_regions(model: FieldModel, regions: Segmentation, graph: ZoneGraph, 
         if chosen[0] > best.objective:
             break
         _, labels, pieces, best = chosen
-    return best
+    return best if within == bounds else _released(model, best, bounds)
+
+
+def _released(model: FieldModel, found: RefinedRegions, bounds: Bounds) -> RefinedRegions:
+    """Return the fit of regions and borders within other bounds: errors are those about a best fit."""
+    start = _Trial(found.theta, found.borders.moves.ravel(), found.point, found.objective)
+    return replace(_with_covariance(model, found.mixing, _descended(model, found.mixing, start, bounds)), apart=found.apart)
 
 
 def _of_one_material(model: FieldModel, found: RefinedRegions, bounds: Bounds) -> list[tuple[int, int, RefinedRegions]]:
@@ -296,10 +304,10 @@ def on_finer_cells(model: FieldModel, law: LawName, found: RefinedRegions, bound
     prior = _prior(mixing)
     residuals, of_before = tuple[FloatArray, ...](), tuple[FloatArray, ...]()
     converged, before, least, of_law = False, here, np.inf, True
-    undone = np.zeros(n)
+    undone, kept = np.zeros(n), KeptStates()
     for _ in range(CORRECTIONS):
         at = model.linearised(model.evaluate(here.point.theta, here.point.states))
-        finer = changes_on_finer_mesh(at, law if of_law else "linear", now.moduli_on)  # no equilibrium once, none later
+        finer = changes_on_finer_mesh(at, law if of_law else "linear", now.moduli_on, kept)  # no equilibrium once, none later
         if finer is None:
             return None
         changes, of_law = finer[0], finer[1] == law
@@ -383,7 +391,9 @@ def _stepped(model: FieldModel, mixing: Mixing, here: _Trial, bounds: Bounds) ->
     at = model.linearised(model.evaluate(here.point.theta, here.point.states))
     quadratic = at.concentrated(slopes, ROUGH_TOLERANCE)
     hessian, gradient = quadratic.hessian + prior.hessian(here.theta), quadratic.gradient + prior.gradient(here.theta, here.moves)
-    step = -np.asarray(np.linalg.solve(hessian, gradient), dtype=float)
+    free = np.concatenate([objective.free(here.theta, gradient[:n]), np.ones(len(gradient) - n, dtype=bool)])
+    step = np.zeros_like(gradient)
+    step[free] = -np.linalg.solve(hessian[np.ix_(free, free)], gradient[free])
     step *= min(1.0, LONGEST / max(np.abs(step[:n]).max(), np.abs(step[n:]).max() / edge, 1e-300))
     moved = at.forward((slopes @ step)[:, None], [b[:, None] for b in quadratic.loaded(step)])
     for halvings in range(HALVINGS):

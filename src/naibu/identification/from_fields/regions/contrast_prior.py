@@ -64,8 +64,8 @@ class BorderPrior:
         return np.asarray(sp.block_diag([ContrastPrior(0, SD_WITH_BORDERS).hessian(theta), sp.diags(of_moves)]).toarray())
 
 
-def moderated(theta: FloatArray, largest: int) -> FloatArray:
-    """Return logarithms of moduli (2 count,) that differ from those of the region number `largest` by no more than `MODERATE`."""
+def moderated(theta: FloatArray, largest: int, part: float = 1.0) -> FloatArray:
+    """Return logarithms of moduli (2 count,) that differ from those of the region `largest` by a part of before, at most of `MODERATE`."""
     values = theta.reshape(2, -1)
     middle = values[:, largest, None]
-    return np.asarray((middle + np.clip(values - middle, -MODERATE, MODERATE)).ravel())
+    return np.asarray((middle + part * np.clip(values - middle, -MODERATE, MODERATE)).ravel())

@@ -25,7 +25,9 @@ from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Point
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Found, Objective, SearchSettings, first_point, search
+from naibu.identification.from_fields.inversion.kept_hessian import KeptHessian
 from naibu.identification.from_fields.inversion.regularization import BULK_WEIGHT, ZoneGraph
+from naibu.identification.from_fields.regions.compressibility import no_less_compressible
 from naibu.identification.from_fields.regions.contrast_prior import ContrastPrior, moderated
 from naibu.identification.from_fields.regions.merging import CLEAR, jump_costs, merged
 
@@ -33,6 +35,9 @@ CLUSTERS = (20, 8)  # to begin with, one after the other: the better end counts
 LIKE = 0.005  # difference of logarithms of moduli between neighbours that belong together at once
 # half of chi squared that a face of a border costs: the number of closed surfaces of n faces on a cubic lattice grows about as 1.7^n
 FACE = 0.55
+# parts of the contrasts of regions about which zones are asked to change sides, until some do: a region of too few has too great a contrast
+# for any other zone to join it
+CONTRASTS = (1.0, 0.5)
 ROUNDS, PAIRS = 12, 3  # of merging and fitting; pairs that are tried where the fit does not confirm a merger
 ROUGHLY = SearchSettings(max_iterations=12, tolerance=1e-5)  # while the regions may still change
 FAR = 0.5  # of a logarithm: whole cells may make an empty region of a soft one, about which derivatives say nothing of the one with borders
@@ -229,11 +234,11 @@ def segment(
     ConvergenceError
         With no number of clusters an equilibrium was found.
     """
-    criterion = Criterion.of(model, graph, start, weight)
+    criterion, within = Criterion.of(model, graph, start, weight), no_less_compressible(model, start.theta, bounds)
     found: list[tuple[float, IntArray, Point, int]] = []
     for most in CLUSTERS:
         try:
-            labels, point, moved = _from_clusters(model, criterion, start, bounds, most, progress)
+            labels, point, moved = _from_clusters(model, criterion, start, within, most, progress)
         except ConvergenceError:
             if most == CLUSTERS[-1] and not found:
                 raise
@@ -249,7 +254,7 @@ def segment(
     labels = np.argsort(order)[labels]
     zones = joined(model.zones, labels)
     regions = model.with_zones(zones)
-    point = _at(regions, point.theta.reshape(2, -1)[:, order].ravel(), point)
+    point = point_at(regions, point.theta.reshape(2, -1)[:, order].ravel(), point)
     return Segmentation(labels, zones, fitted_nearby(regions, point, bounds, progress), max(CLUSTERS), moved)
 
 
@@ -311,9 +316,10 @@ def _from_clusters(
     labels = clusters(graph, start.theta, most)
     volume = np.bincount(labels, graph.volume)
     theta = np.concatenate([np.bincount(labels, graph.volume * t) / volume for t in start.theta.reshape(2, -1)])
-    point, moved, near = _at(model.with_zones(joined(model.zones, labels)), theta, start), 0, None
+    point, moved, near = point_at(model.with_zones(joined(model.zones, labels)), theta, start), 0, None
     for _ in range(ROUNDS):
         fitted = model.with_zones(joined(model.zones, labels))
+        point = fitted.evaluate(point.theta, point.states)  # factors are those of what was tried last
         quadratic = fitted.linearised(point).concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE, near)
         before, changed = int(labels.max()), 0
         end = _with_less(model, criterion, (labels, point, quadratic), bounds, progress)
@@ -336,15 +342,16 @@ def _with_less(
     """Return regions of which up to half were merged, and their fit; None where all that was tried costs more than before.
 
     Merging goes by a quadratic approximation, which says nothing far away: that about a lump of too few cells, nearly empty, knows of no
-    stiffer one. It counts only if the fit confirms it; otherwise pairs are tried, one at a time.
+    stiffer one. It counts only if the fit confirms it; otherwise fewer are merged, and pairs are tried, one at a time.
     """
     labels, point, quadratic = here
     scaled, area = _scaled(quadratic, criterion.scale), areas_between(criterion.graph, labels)
     below, apart = criterion.value(labels, point), np.zeros(area.shape, dtype=bool)
-    for most in (max(1, len(area) // 2), *[1] * PAIRS):
+    for most in _numbers_of_mergers(len(area)):
         united, theta = merged(scaled, point.theta, area, criterion.weight, criterion.charge, most, apart)
         gather = np.kron(np.eye(2), np.eye(int(united.max()) + 1)[united])
-        new, found = _refitted(model, criterion, united[labels], theta, point, bounds, progress, [x @ gather for x in quadratic.response])
+        start = _Start(theta, point, _gathered(quadratic, gather), float(np.abs(gather @ theta - point.theta).max()) > FAR)
+        new, found = _refitted(model, criterion, united[labels], start, bounds, progress)
         if int(united.max()) + 1 == len(area) or criterion.value(new, found.point) < below:
             return new, found
         if most == 1:
@@ -352,7 +359,23 @@ def _with_less(
     return None
 
 
-def _at(model: FieldModel, theta: FloatArray, near: Point) -> Point:
+def _numbers_of_mergers(regions: int) -> list[int]:
+    """Return how many regions to merge at once, one number after the other while fits do not confirm it."""
+    half = max(1, regions // 2)
+    return [*(half >> k for k in range(half.bit_length() - 1)), *[1] * (PAIRS + (half == 1))]
+
+
+def _gathered(quadratic: Concentrated, gather: FloatArray) -> Concentrated:
+    """Return a quadratic in all moduli as one in those of merged regions, from which `gather` (2 before, 2 after) makes all."""
+    return replace(
+        quadratic,
+        hessian=gather.T @ quadratic.hessian @ gather,
+        gradient=gather.T @ quadratic.gradient,
+        response=[x @ gather for x in quadratic.response],
+    )
+
+
+def point_at(model: FieldModel, theta: FloatArray, near: Point) -> Point:
     """Return the point at moduli, with the motion of the surface of a point before, or one that suits these moduli better.
 
     Where the noise of the measurement is a large part of the strain in a cell, the surface that was found with a cell of one modulus may
@@ -368,24 +391,32 @@ def _scaled(quadratic: Concentrated, scale: float) -> Concentrated:
     return replace(quadratic, hessian=quadratic.hessian / scale, gradient=quadratic.gradient / scale)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Start:
+    """Where a fit of regions begins: moduli (2 regions,), a point with the motion of the surface, and what derivatives are known.
+
+    Those are of no use where they are from `far` away.
+    """
+
+    theta: FloatArray
+    near: Point
+    quadratic: Concentrated | None = None
+    far: bool = False
+
+
 def _refitted(
-    model: FieldModel,
-    criterion: Criterion,
-    labels: IntArray,
-    theta: FloatArray,
-    near: Point,
-    bounds: Bounds,
-    progress: Progress | None,
-    response: list[FloatArray] | None = None,
+    model: FieldModel, criterion: Criterion, labels: IntArray, start: _Start, bounds: Bounds, progress: Progress | None
 ) -> tuple[IntArray, Found]:
     """Fit the moduli of regions to the measurements and the prior of contrasts; regions that have no zone any more are left out."""
     kept, labels = np.unique(labels, return_inverse=True)
-    of_kept = np.concatenate([kept, kept + len(theta) // 2])
-    response = None if response is None else [x[:, of_kept] for x in response]
     regions = model.with_zones(joined(model.zones, labels))
     objective = Objective(criterion.prior(labels), criterion.scale, bounds)
-    start = _at(regions, objective.clipped(theta.reshape(2, -1)[:, kept].ravel()), near)
-    return labels.astype(np.int64), search(regions, start, objective, ROUGHLY, near=response, progress=progress)
+    theta = objective.clipped(start.theta.reshape(2, -1)[:, kept].ravel())
+    known = start.quadratic is not None and len(start.quadratic.hessian) == len(theta)
+    rule = KeptHessian(theta, start.quadratic) if known and not start.far else KeptHessian()
+    response = start.quadratic.response if known and start.quadratic is not None else None
+    found = search(regions, point_at(regions, theta, start.near), objective, ROUGHLY, rule=rule, near=response, progress=progress)
+    return labels.astype(np.int64), found
 
 
 def _with_better_borders(
@@ -398,14 +429,16 @@ def _with_better_borders(
         movable = np.unique(graph.pairs[labels[graph.pairs[:, 0]] != labels[graph.pairs[:, 1]]])
     if len(movable) > EXPLICIT:
         return labels, point, 0
-    theta = moderated(point.theta, criterion.prior(labels).largest)
-    everywhere = _at(model, theta.reshape(2, -1)[:, labels].ravel(), point)
-    slopes = np.asarray(np.kron(np.eye(2), np.eye(graph.count)[:, movable]), dtype=float)
-    quadratic = _scaled(model.linearised(everywhere).concentrated(slopes, ROUGH_TOLERANCE), criterion.scale)
-    found, moves = border_moves(graph, labels, theta, quadratic, criterion.weight, movable)
-    if not moves:
-        return labels, point, 0
-    new, refitted = _refitted(model, criterion, found, theta, point, bounds, progress)
-    if not criterion.value(new, refitted.point) < criterion.value(labels, point):  # the approximation says nothing far away
-        return labels, point, 0
-    return new, refitted.point, moves
+    largest = criterion.prior(labels).largest
+    for part in CONTRASTS:
+        theta = moderated(point.theta, largest, part)
+        everywhere = point_at(model, theta.reshape(2, -1)[:, labels].ravel(), point)
+        slopes = np.asarray(np.kron(np.eye(2), np.eye(graph.count)[:, movable]), dtype=float)
+        quadratic = _scaled(model.linearised(everywhere).concentrated(slopes, ROUGH_TOLERANCE), criterion.scale)
+        found, moves = border_moves(graph, labels, theta, quadratic, criterion.weight, movable)
+        if not moves:
+            continue
+        new, refitted = _refitted(model, criterion, found, _Start(theta, point), bounds, progress)
+        if criterion.value(new, refitted.point) < criterion.value(labels, point):  # the approximation says nothing far away
+            return new, refitted.point, moves
+    return labels, point, 0
