@@ -24,18 +24,21 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from records import ResultTable, write_record
 
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
+from naibu.identification.lattice_calibration.captured.sensor_errors import SensorErrorNames, SensorErrors
 from naibu.identification.lattice_calibration.evaluation import residuals_at
-from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD, calibrate_lattice
+from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD
 from naibu.identification.lattice_calibration.study_model import StudyModel
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import FRICTION, SHIFT, StudyUnknowns
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
+from naibu.workflows.studies.calibration_starts import searched
 from naibu.workflows.studies.lattice_study import prepared_study
 
 Array = NDArray[np.float64]
@@ -124,7 +127,9 @@ def truth_of(unknowns: StudyUnknowns, rng: np.random.Generator) -> Array:
     return truth
 
 
-def problem_of(unknowns: StudyUnknowns, truth: Array, pace: float, rng: np.random.Generator, divided: int = 1) -> StudyProblem:
+def problem_of(
+    unknowns: StudyUnknowns, truth: Array, pace: float, rng: np.random.Generator, divided: int = 1, sought: SensorErrorNames = "none"
+) -> StudyProblem:
     """Record the truth with steps of time that are shorter than those of the study by `divided`, and set up its identification."""
     study = replace(unknowns.study, step_s=unknowns.study.step_s / divided, sample_steps=unknowns.study.sample_steps * divided)
     steps = round(study.frames * study.frame_s / study.step_s)
@@ -138,7 +143,8 @@ def problem_of(unknowns: StudyUnknowns, truth: Array, pace: float, rng: np.rando
     times = np.arange(0.5 / SENSOR_HZ, steps * study.step_s, 1.0 / SENSOR_HZ)
     at = np.minimum((times / study.step_s).astype(int), steps - 1)
     force = made.force[at, 1] + FORCE_SD_MN * rng.standard_normal((len(times), 3))
-    return StudyProblem.of(unknowns, clouds, RecordedForces.of(unknowns.study, [(1, times, force)]), point_sd_mm=POINT_SD_MM)
+    recorded, errors = RecordedForces.of(unknowns.study, [(1, times, force)]), SensorErrors.named(sought)
+    return StudyProblem.of(unknowns, clouds, recorded, point_sd_mm=POINT_SD_MM, sensor_errors=errors)
 
 
 def spread(triangles: Array, rng: np.random.Generator) -> Array:
@@ -148,15 +154,17 @@ def spread(triangles: Array, rng: np.random.Generator) -> Array:
     return np.asarray((triangles[rng.choice(len(area), POINTS, p=area / area.sum())] * weights[:, :, None]).sum(axis=1))
 
 
-def drawn(seed: int, *, cells: int, unknown: str, pace: float = 1.0, threads: int, divided: int = 1) -> Draw:
+def drawn(
+    seed: int, *, cells: int, unknown: str, pace: float = 1.0, threads: int, divided: int = 1, sought: SensorErrorNames = "none"
+) -> Draw:
     """Calibrate one truth."""
     rng = np.random.default_rng([seed, 15])
     with tempfile.TemporaryDirectory() as folder:
         unknowns = unknowns_of(study_of(cells, unknown, pace, Path(folder)), unknown)
     truth = truth_of(unknowns, rng)
-    problem = problem_of(unknowns, truth, pace, rng, divided)
+    problem = problem_of(unknowns, truth, pace, rng, divided, sought)
     began, busy = time.perf_counter(), time.process_time()
-    found = calibrate_lattice(problem, unknowns.start, threads=threads)
+    found = searched(problem, unknowns.start, method="gauss-newton", seed=0, max_runs=0, threads=threads, progress=None)
     wall, busy = time.perf_counter() - began, time.process_time() - busy
     half = 0.5 * np.diff(np.log(found.intervals()), axis=1)[:, 0]
     return Draw(unknowns.names, np.log(found.values / truth), half, wall, busy, found.runs, found.noise_factor, found.settled)
@@ -191,6 +199,7 @@ def main() -> None:
     parser.add_argument("--pace", type=float, default=1.0, help="how many times faster all is done than in 5 s")
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
     parser.add_argument("--divided", type=int, default=1, help="by how much steps of time of the truth are shorter than those of the model")
+    parser.add_argument("--sensor-errors", choices=get_args(SensorErrorNames), default="none", help="sought along; the sensor has none")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1, help="processes, one draw each")
     parser.add_argument("--record", action="store_true")
@@ -200,7 +209,15 @@ def main() -> None:
         differences(cells=chosen.cells, unknown=chosen.unknown, pace=chosen.pace, threads=chosen.threads)
         return
     threads = chosen.threads if chosen.workers == 1 else 1
-    one = partial(drawn, cells=chosen.cells, unknown=chosen.unknown, pace=chosen.pace, threads=threads, divided=chosen.divided)
+    one = partial(
+        drawn,
+        cells=chosen.cells,
+        unknown=chosen.unknown,
+        pace=chosen.pace,
+        threads=threads,
+        divided=chosen.divided,
+        sought=chosen.sensor_errors,
+    )
     seeds = range(chosen.first, chosen.first + chosen.draws)
     found: list[Draw] = []
     with ProcessPoolExecutor(chosen.workers) as pool:

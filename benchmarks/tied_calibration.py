@@ -1,6 +1,6 @@
 """Whether 95 % intervals of `naibu calibrate` hold, with tied boxes: draws of the virtual dough of ``naibu calibrate --example``.
 
-Run: python benchmarks/tied_calibration.py [--draws 9] [--first 0]
+Run: python benchmarks/tied_calibration.py [--draws 9] [--first 0] [--sensor-errors "offset and delay"]
 
 Every draw is a seed of the example: five captures of 2800 points and two force sensors, nine parameters. Printed are simulations and
 processor time of every draw, which truths its intervals miss and by how many standard deviations, and how many are held in all.
@@ -12,9 +12,11 @@ import argparse
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import get_args
 
 import numpy as np
 
+from naibu.identification.lattice_calibration.captured.sensor_errors import SensorErrorNames
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
 from naibu.workflows.studies.calibrate import calibrate_study
 from naibu.workflows.studies.calibration_example import SOURCE, write_calibration_example
@@ -26,6 +28,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=9)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--sensor-errors", choices=get_args(SensorErrorNames), default="none", help="sought along; the sensors have none")
     options = parser.parse_args()
     truth = StudyUnknowns.of(prepared_study(SOURCE).study).start
     held, widths = [], []
@@ -33,7 +36,9 @@ def main() -> None:
         began = time.process_time()
         with TemporaryDirectory() as folder:
             study, shapes, forces = write_calibration_example(Path(folder) / "dough", seed=seed)
-            found = calibrate_study(study, shapes=[shapes], forces=[forces], out=Path(folder) / "found").estimate
+            found = calibrate_study(
+                study, shapes=[shapes], forces=[forces], out=Path(folder) / "found", sensor_errors=options.sensor_errors
+            ).estimate
         low, high = found.intervals().T
         within = (low <= truth) & (truth <= high)
         off = np.log(found.values / truth) / np.sqrt(np.diag(found.covariance))

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
-from naibu.identification.lattice_calibration.captured.force_history import DelayedMeans
+from naibu.identification.lattice_calibration.captured.force_history import SampledMeans
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.captured.sensor_errors import NO_ERRORS, SensorErrors
 from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
@@ -109,13 +109,29 @@ def test_means_of_delayed_forces_are_integrals(delay: float) -> None:
     borders = np.concatenate([np.arange(0.0, 0.1, 0.002), np.arange(0.1, 0.401, 0.004)])
     force = (np.cos(20.0 * borders[:-1]) - np.cos(20.0 * borders[1:])) / (20.0 * np.diff(borders))
     shares = np.full(200, 0.1)
-    means = DelayedMeans.of(borders, force[:, None], shares, 10, 0.002)
+    means = SampledMeans.of(borders, force[:, None, None] * np.ones(3), shares, np.zeros(200), 10, 0.002)
     edges = 0.02 * np.arange(21) - delay
     found, rate = means(delay)
     expected = (np.cos(20.0 * edges[:-1]) - np.cos(20.0 * edges[1:])) / 0.4
     inside = slice(1, -1)
-    np.testing.assert_allclose(found[inside, 0], expected[inside], atol=1e-4)
-    np.testing.assert_allclose(rate[inside, 0], ((np.sin(20.0 * edges[:-1]) - np.sin(20.0 * edges[1:])) / 0.02)[inside], atol=0.05)
+    np.testing.assert_allclose(found[inside, 0, 1], expected[inside], atol=1e-4)
+    np.testing.assert_allclose(rate[inside, 0, 2], ((np.sin(20.0 * edges[:-1]) - np.sin(20.0 * edges[1:])) / 0.02)[inside], atol=0.05)
+
+
+@pytest.mark.parametrize("phase", [0.0003, 0.0018])
+def test_samples_count_when_they_are_taken(phase: float) -> None:
+    """Of one sample in every step, 0.3 or 1.8 ms after its beginning, of a force that jumps between two of them."""
+    step, borders = 0.002, 0.002 * np.arange(201)
+
+    def forces(times: FloatArray) -> FloatArray:
+        return np.asarray(np.sin(10.0 * times) + 5.0 * (times > 0.2) - 3.0 * (times > 0.31))
+
+    inside = (np.arange(20) + 0.5) / 20.0 * step
+    of_steps = forces(borders[:-1, None] + inside).mean(axis=1)
+    means = SampledMeans.of(borders, of_steps[:, None, None] * np.ones(3), np.full(200, 0.1), np.full(200, phase - 0.5 * step), 10, step)
+    expected = forces(borders[:-1] + phase).reshape(20, 10).mean(axis=1)
+    np.testing.assert_allclose(means(0.0)[0][:, 0, 0], expected, atol=1e-3)
+    assert np.abs(of_steps.reshape(20, 10).mean(axis=1) - expected).max() > 5e-3  # where they count as taken in the middle
 
 
 @pytest.mark.parametrize(("late_s", "offset"), [(0.0, 0.0), (0.008, 0.0), (-0.02, 0.0), (0.0, 120.0), (0.008, -60.0)])
@@ -130,7 +146,7 @@ def test_intervals_hold_whatever_the_errors_of_the_sensor(
         deviations.append(np.log(found.values / TRUTH) / np.sqrt(np.diag(found.covariance)))
         assert found.determined().all()
         told = {error.quantity: error for error in sensor_errors_found(made, found)}
-        assert told["delay"].value == pytest.approx(late_s, abs=max(4.0 * told["delay"].sd, 0.0005))
+        assert told["delay"].value == pytest.approx(late_s, abs=max(4.0 * told["delay"].sd, 0.00005))
         assert told["offset along z"].value == pytest.approx(offset, abs=4.0 * told["offset along z"].sd)
     assert np.abs(deviations).max() < 3.5  # once in two hundred such dozens
     assert (np.abs(deviations) < 1.96).sum() >= 9

@@ -60,6 +60,42 @@ def test_intervals_reach_to_the_end_of_the_profile_along_a_curved_valley(sd: flo
     assert bool(widened.unconfirmed) == (expected > FARTHEST)  # up to there chi-squared is followed
 
 
+class Branches:
+    """Two valleys, in relative changes x and y: x + y is determined to `SD`, y is 0 or `BETWEEN`, where chi-squared is higher by 2."""
+
+    BETWEEN, SD, runs = 0.2, 0.025, 0
+
+    def residual(self, theta: np.ndarray) -> Residual:
+        x, y = np.expm1(theta)
+        return np.array([(x + y) / self.SD, np.sqrt(2.0) * y / self.BETWEEN]), np.array([200.0 * y * (y - self.BETWEEN)])
+
+    def point(self) -> EvaluatedPoint:
+        slopes = (np.array([[1.0, 1.0], [0.0, self.SD * np.sqrt(2.0) / self.BETWEEN]]) / self.SD, np.array([[0.0, -200.0 * self.BETWEEN]]))
+        return EvaluatedPoint(np.zeros(2), self.residual(np.zeros(2)), slopes)
+
+    def many(self, _: Any, trials: list[tuple[np.ndarray, bool]]) -> list[Residual]:
+        self.runs += len(trials)
+        return [self.residual(theta) for theta, _ in trials]
+
+    def profile(self, k: int) -> np.ndarray:
+        """Return the farthest places, down and up, where chi-squared is within its quantile: on a grid."""
+        x, y = np.meshgrid(np.linspace(-0.4, 0.4, 1601), np.linspace(-0.4, 0.4, 1601), indexing="ij")
+        (first, second), (third,) = ((x + y) / self.SD, np.sqrt(2.0) * y / self.BETWEEN), (200.0 * y * (y - self.BETWEEN),)
+        within = np.log1p((x, y)[k][first**2 + second**2 + third**2 < RISE])
+        return np.array([within.min(), within.max()])
+
+
+def test_intervals_reach_to_values_that_fit_as_well_beyond_others_that_do_not() -> None:
+    """Between the valleys chi-squared rises above its quantile, whatever the other value: the first crossing is no end."""
+    law = Branches()
+    widened = widened_covariance(law, law.point(), np.zeros(2), WEAK_PRIOR, law)  # type: ignore[arg-type]
+    expected = [np.abs(law.profile(k)).max() for k in range(2)]
+    assert expected[0] > 4.0 * 1.96 * law.SD
+    np.testing.assert_allclose(1.96 * np.sqrt(np.diag(widened.covariance)), expected, rtol=0.03)
+    assert widened.unconfirmed == ()
+    assert law.runs < 40
+
+
 def test_ends_that_no_simulation_confirms_are_told_and_not_drawn_in() -> None:
     """The profile rises to its quantile far beyond where it is followed."""
     law = Sum(5.0)

@@ -145,10 +145,10 @@ class StudyProblem:
         shorter = replace(study, step_s=0.5 * study.step_s, sample_steps=2 * study.sample_steps)
         cases = []
         for case in self.load_cases:
-            forces = case.forces.with_half_steps()
-            times = [study.step_s * step for step in case.fine.captures]
-            fine = StudyModel.of(shorter, times, len(forces.force), forces.window_steps, coarse=False, shares=forces.shares)
-            cases.append(replace(case, forces=forces, fine=fine))
+            forces, times = case.forces, [study.step_s * step for step in case.fine.captures]
+            shares = 0.5 * np.repeat(forces.shares, 2, axis=0)
+            fine = StudyModel.of(shorter, times, len(forces.force), 2 * forces.window_steps, coarse=False, shares=shares)
+            cases.append(replace(case, fine=fine))
         return replace(self, unknowns=replace(self.unknowns, study=shorter), load_cases=tuple(cases))
 
     def weighed(
@@ -177,10 +177,10 @@ class StudyProblem:
 
     def of_bodies(self, forces: RecordedForces, found: Reproduced) -> dict[int, BodyResiduals]:
         """Return the residuals of every body that has a record, with what errors of its sensor explain."""
-        errors, step_s, excess = self.sensor_errors, self.unknowns.study.step_s, self.excess[1]
+        errors, excess = self.sensor_errors, self.excess[1]
         recorded = np.flatnonzero(np.isfinite(forces.force).any(axis=(0, 2)))
         return {
-            body: body_residuals(errors, forces, body, step_s, found.force[:, body], found.force_change[:, :, body], found.history, excess)
+            body: body_residuals(errors, forces, body, found.force[:, body], found.force_change[:, :, body], found.history, excess)
             for body in recorded.tolist()
         }
 

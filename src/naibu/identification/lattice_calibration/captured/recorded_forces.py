@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,20 +24,26 @@ class RecordedForces:
     ----------
     window_steps : int
         Steps of the study in a window.
+    step_s : float
+        Their length, s.
     force : ndarray, shape (windows, bodies, 3)
         mN; NaN where nothing was recorded.
     samples : ndarray, shape (windows, bodies)
         Number of samples that were averaged.
     shares : ndarray, shape (windows * window_steps, bodies)
         Of the steps in the means of their windows, by the samples that were taken in them: simulated forces are averaged alike.
+    phase_s : ndarray, shape (windows * window_steps, bodies)
+        How much later than the middle of its step a sample was taken, on the average of those in a step, s.
     sd_mn : ndarray, shape (bodies,)
         Standard deviation of a component in one sample.
     """
 
     window_steps: int
+    step_s: float
     force: FloatArray
     samples: FloatArray
     shares: FloatArray
+    phase_s: FloatArray
     sd_mn: FloatArray
 
     @classmethod
@@ -82,6 +88,7 @@ class RecordedForces:
                 "is the unit of times another one, to be named in the column, as in time_ms?"
             )
         shares = np.full((windows * each, bodies), 1.0 / each)
+        phase = np.zeros_like(shares)
         sums, samples, sd = np.zeros((windows, bodies, 3)), np.zeros((windows, bodies)), np.full(bodies, np.nan)
         for body, times, force in records:
             place = np.floor(times / (each * study.step_s) - 1e-9).astype(np.int64)
@@ -94,16 +101,15 @@ class RecordedForces:
                 )
             np.add.at(sums[:, body], place[inside], force[inside])
             np.add.at(samples[:, body], place[inside], 1.0)
-            count = np.bincount(np.floor(times[inside] / study.step_s - 1e-9).astype(np.int64), minlength=windows * each)
+            taken = np.floor(times[inside] / study.step_s - 1e-9).astype(np.int64)
+            count = np.bincount(taken, minlength=windows * each)
             shares[:, body] = count / np.maximum(np.repeat(samples[:, body], each), 1.0)
+            late = times[inside] - study.step_s * (taken + 0.5)
+            phase[:, body] = np.bincount(taken, weights=late, minlength=windows * each) / np.maximum(count, 1)
             sd[body] = sd_mn if sd_mn is not None else _noise(study.bodies[body].name, force)
         last = int(np.flatnonzero(samples.any(axis=1))[-1]) + 1 if records else 0
         mean = np.where(samples[:last, :, None] > 0.0, sums[:last] / np.maximum(samples[:last, :, None], 1.0), np.nan)
-        return cls(each, mean, samples[:last], shares[: last * each], sd)
-
-    def with_half_steps(self) -> RecordedForces:
-        """Return the same means for a study whose steps are half as long."""
-        return replace(self, window_steps=2 * self.window_steps, shares=0.5 * np.repeat(self.shares, 2, axis=0))
+        return cls(each, study.step_s, mean, samples[:last], shares[: last * each], phase[: last * each], sd)
 
 
 def _noise(name: str, force: FloatArray) -> float:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -17,7 +18,7 @@ import scipy.optimize
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
-from naibu.identification.lattice_calibration.captured.force_history import DelayedMeans, ForceHistory
+from naibu.identification.lattice_calibration.captured.force_history import ForceHistory, SampledMeans
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 
 MOST_DELAY_S = 0.2  # either way
@@ -120,7 +121,6 @@ def body_residuals(
     errors: SensorErrors,
     record: RecordedForces,
     body: int,
-    step_s: float,
     means: FloatArray,
     means_change: FloatArray,
     history: ForceHistory | None,
@@ -136,19 +136,17 @@ def body_residuals(
         What was measured.
     body : int
         Its number; it has a record.
-    step_s : float
-        Fine step, s.
     means, means_change : ndarray, shape (windows, 3), (p, windows, 3)
         Simulated means over the windows and their derivatives, mN.
     history : ForceHistory, optional
-        What they are means of; needed for a delay.
+        What they are means of; needed for a delay, and for samples that are not taken in the middle of steps.
     excess : float
         Factor of the noise.
     """
     seen = record.force[:, body]
     counted = np.asarray(np.isfinite(seen).all(axis=1))
     weight = np.sqrt(record.samples[counted, body])[:, None] / (excess * record.sd_mn[body])
-    middle = record.window_steps * step_s * (np.flatnonzero(counted) + 0.5)
+    middle = record.window_steps * record.step_s * (np.flatnonzero(counted) + 0.5)
     design = np.power.outer(middle - middle.mean(), np.arange(errors.steady))
     basis, upper = np.linalg.qr(weight * design)
 
@@ -156,19 +154,15 @@ def body_residuals(
         return rows - basis @ (basis.T @ rows)
 
     delay, rate = 0.0, np.zeros_like(seen)
-    if errors.delay and history is not None:
-        shares = record.shares[:, body]
-        of_body = DelayedMeans.of(history.borders, history.force[:, body], shares, record.window_steps, step_s)
-        delay = _best_delay(lambda tau: float((without(weight * (of_body(tau)[0] - seen)[counted]) ** 2).sum()))
-        means, rate = of_body(delay)
-        p, n = len(history.change), len(history.force)
-        if p:
-            flat = history.change[:, :, body].transpose(1, 0, 2).reshape(n, 3 * p)
-            moved = DelayedMeans.of(history.borders, flat, shares, record.window_steps, step_s)(delay)[0]
-            means_change = moved.reshape(-1, p, 3).transpose(1, 0, 2)
+    if history is not None and (errors.delay or np.abs(record.phase_s[:, body]).max() > EXACT_S):
+
+        def cost(means: FloatArray) -> float:
+            return float((without(weight * (means - seen)[counted]) ** 2).sum())
+
+        delay, means, means_change, rate = _sampled(record, body, history, cost if errors.delay else None)
     raw, raw_slopes = weight * (means - seen)[counted], weight * means_change[:, counted]
     residual, slopes = without(raw), raw_slopes - basis @ (basis.T @ raw_slopes)
-    along, stiffness = without(weight * rate[counted]), DELAY_SD_S**-2
+    along, stiffness = without(weight * rate[counted]) * float(errors.delay), DELAY_SD_S**-2
     variance = 1.0 / (float((along**2).sum()) + stiffness)
     delay_slopes = -variance * np.tensordot(slopes, along, axes=([1, 2], [0, 1]))
     slopes = slopes + delay_slopes[:, None, None] * along
@@ -181,6 +175,25 @@ def body_residuals(
         counted, residual, slopes, explained, explained_slopes, spread, means, seen[counted] - design @ explained, delay, delay_slopes,
         variance if errors.delay else 0.0,
     )  # fmt: skip
+
+
+def _sampled(
+    record: RecordedForces, body: int, history: ForceHistory, cost: Callable[[FloatArray], float] | None
+) -> tuple[float, FloatArray, FloatArray, FloatArray]:
+    """Return the delay of least cost of means (windows, 3), 0 without a cost; the means, and their derivatives by all else and by it."""
+    sampled = partial(
+        SampledMeans.of,
+        shares=record.shares[:, body],
+        phase_s=record.phase_s[:, body],
+        window_steps=record.window_steps,
+        step_s=record.step_s,
+    )
+    force, delay = history.force[:, body, None], 0.0
+    if cost is not None:
+        late = sampled(history.borders, force)
+        delay = _best_delay(lambda tau: cost(late(tau)[0][:, 0]))
+    means, rate = sampled(history.borders, np.concatenate([force, history.change[:, :, body].transpose(1, 0, 2)], axis=1))(delay)
+    return delay, means[:, 0], means[:, 1:].transpose(1, 0, 2), rate[:, 0]
 
 
 def _best_delay(cost: Callable[[float], float]) -> float:

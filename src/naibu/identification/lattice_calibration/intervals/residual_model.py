@@ -7,6 +7,7 @@ the values, and what curves along the least determined combinations can be told 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,6 +21,7 @@ DAMPING = (0.0, 1e-3, 1e-2, 0.1, 1.0, 10.0, 100.0)  # shares of the diagonal, tr
 REFITS = 30  # steps of a fit
 FITTED = 1e-4  # decrease of chi-squared that ends it
 CLOSE = 0.005  # to its root
+FARTHER = (0.3, 0.8, 1.6, 3.0)  # of the way to an end, at which other values are looked for that fit as well
 
 
 @dataclass(slots=True)
@@ -119,12 +121,12 @@ class ModelledCost:
     def end(self, theta: FloatArray, lowest: float, k: int, reach: float, farthest: float) -> FloatArray:
         """Return where chi-squared, all others fitted again, has risen by `RISE` as parameter k goes to one side.
 
-        It is followed from a minimum (p,), along its valley, in steps that grow.
+        It is followed from a minimum (p,), or other values within it, along its valley, in steps that grow.
 
         Parameters
         ----------
         theta, lowest
-            Minimum, and chi-squared there.
+            Where it begins, and chi-squared at the minimum.
         k : int
             Number of the parameter.
         reach : float
@@ -133,7 +135,7 @@ class ModelledCost:
             Change at which it ends even where chi-squared has risen by less, or earlier where no logarithm may change any more.
         """
         free, side = np.delete(np.arange(len(theta), dtype=np.int64), k), float(np.sign(reach))
-        here, low, step = theta, lowest, 0.25 * abs(reach)
+        here, low, step = theta, self(theta)[0], 0.25 * abs(reach)
         last = self._held(theta + side * farthest * np.eye(len(theta))[k])[k]
         while (left := side * (last - here[k])) > 1e-9:
             tangent = np.linalg.solve(self(here)[2], np.eye(len(theta))[k])
@@ -143,6 +145,38 @@ class ModelledCost:
                 return self._between(here, ahead, free, (low - lowest, high - lowest))
             here, low, step = there, high, 1.4 * step
         return here
+
+    def beyond(
+        self, end: FloatArray, starts: Sequence[FloatArray], lowest: float, k: int, reach: float, farthest: float
+    ) -> FloatArray | None:
+        """Return where, farther out than an end (p,), chi-squared is within `RISE` again; None if nowhere that is found.
+
+        Where values compensate each other in several ways, what the others are fitted to from the end on is the nearest of several
+        minima. They are fitted anew from all of `starts`.
+
+        Parameters
+        ----------
+        end : ndarray, shape (p,)
+            Where chi-squared has risen on the way from the minimum.
+        starts : sequence of ndarray, shape (p,)
+            Other logarithms.
+        lowest, k, farthest
+            As for `end`.
+        reach : float
+            Change of the logarithm of parameter k at the end, with the sign of the side.
+        """
+        free, last = np.delete(np.arange(len(end), dtype=np.int64), k), self.model.point.theta[k] + np.sign(reach) * farthest
+        for part in FARTHER:
+            place = end[k] + part * reach
+            if np.sign(reach) * (last - place) <= 0.0:
+                break
+            for start in starts:
+                moved = self._held(start)
+                moved[k] = place
+                there, cost = self.fitted(moved, free)
+                if cost < lowest + RISE:
+                    return there
+        return None
 
     def _between(self, here: FloatArray, ahead: FloatArray, free: IntArray, rises: tuple[float, float]) -> FloatArray:
         """Return where it has risen by `RISE` on the way ahead; the root of what rises is nearly linear."""

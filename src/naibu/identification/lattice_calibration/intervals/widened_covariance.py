@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,17 +19,23 @@ NEAR = 0.3  # relative change of values at which that is looked at, at most
 LEAST_FACTOR = 0.3  # by which it makes a value smaller, at most
 ROUNDS = 4  # simulations of an end, at most
 MET = 0.03  # of RISE, within which a simulation must confirm it
+BRANCHES = 2  # times that ends are sought beyond other values that fit as well
+STARTS, SPREAD = 8, 2.0  # random values, and standard deviations over those of the estimate, from which others are sought that fit as well
 WIDEST = 3.0  # times farther than what was simulated, at most
 QUANTILE = 1.96
 
 
 @dataclass(slots=True)
 class _End:
-    """An end of the interval of parameter k: where it is sought, and what residuals there differ by from those of the model."""
+    """An end of the interval of parameter k: where it is sought, and what residuals there differ by from those of the model.
+
+    The way to it begins at the minimum, or at other values that fit as well, `begin` (p,).
+    """
 
     k: int
     reach: float
     at: FloatArray
+    begin: FloatArray | None = None
     offset: FloatArray | None = None
     rise: float = 0.0
 
@@ -86,9 +92,11 @@ def widened_covariance(
     Values that compensate each other lie along a curved valley of chi-squared, which derivatives at its bottom do not tell. How residuals
     curve along the least determined combinations is told by simulations around the point (`ResidualModel`). The ends of all intervals,
     along the valley, are sought with that model and simulated; what residuals there differ by is added to those of the model, and the end
-    is sought again, until the simulation confirms it (output space mapping; :cite:t:`bandler2004`). Standard deviations reach the farther
-    end. They are never less than derivatives say. Where no simulation confirms an end, it is not drawn in, but moved out by the square
-    root of what chi-squared lacks there, up to `WIDEST` times.
+    is sought again, until the simulation confirms it (output space mapping; :cite:t:`bandler2004`). Valleys may be several: beyond every
+    end all other values are fitted anew, from those of the other ends and from random ones, and where chi-squared is within its quantile
+    there, the end behind is sought as well. Standard deviations reach the farthest end. They are never less than derivatives say. Where
+    no simulation confirms an end, it is not drawn in, but moved out by the square root of what chi-squared lacks there, up to `WIDEST`
+    times.
 
     Parameters
     ----------
@@ -120,21 +128,58 @@ def widened_covariance(
     simulated(_around(point.theta, weak * np.minimum(np.sqrt(values[::-1][:WEAK]), NEAR)))
     reached = QUANTILE * np.sqrt(np.diag(covariance))
     ends = [_End(k, side * float(reach), point.theta) for k, reach in enumerate(reached) for side in (-1.0, 1.0)]
-    for _ in range(ROUNDS):
-        moving = [end for end in ends if not end.met]
-        if not moving:
+    ends = _confirmed(ends, model, lowest, simulated)
+    for _ in range(BRANCHES):
+        others = _confirmed(_others(ends, model, lowest, covariance), model, lowest, simulated)
+        if not others:
             break
-        bottom, _ = model.cost().fitted(point.theta, np.arange(len(point.theta), dtype=np.int64))
-        for end in moving:
-            end.at = model.cost(end.offset).end(bottom, lowest, end.k, end.reach, FARTHEST)
-        for end, residual in zip(moving, simulated([end.at for end in moving]), strict=True):
-            end.rise = cost_at(residual, end.at, centre, prior_sd) - lowest
-            end.offset = np.concatenate(residual) - model.predicted(end.at)
+        ends += others
     for end in ends:
         reached[end.k] = max(reached[end.k], end.distance(point.theta))
     factor = reached / (QUANTILE * np.sqrt(np.diag(covariance)))
     unconfirmed = tuple(sorted({end.k for end in ends if not end.met}))
     return WidenedCovariance(covariance * np.outer(factor, factor), unconfirmed, max(0.0, -min(end.rise for end in ends)))
+
+
+def _confirmed(
+    ends: list[_End], model: ResidualModel, lowest: float, simulated: Callable[[list[FloatArray]], list[Residual]]
+) -> list[_End]:
+    """Return ends that are sought with a model and simulated in turns, without those at values that turn out to fit no longer."""
+    centre, sd, every = model.centre, model.prior_sd, np.arange(len(model.centre), dtype=np.int64)
+    for _ in range(ROUNDS):
+        ends = [end for end in ends if end.begin is None or end.met or _fits(end, model, lowest)]
+        if not (moving := [end for end in ends if not end.met]):
+            break
+        bottom, _ = model.cost().fitted(model.point.theta, every)
+        for end in moving:
+            begin = bottom if end.begin is None else end.begin
+            end.at = model.cost(end.offset).end(begin, lowest, end.k, end.reach, FARTHEST)
+        for end, residual in zip(moving, simulated([end.at for end in moving]), strict=True):
+            end.rise = cost_at(residual, end.at, centre, sd) - lowest
+            end.offset = np.concatenate(residual) - model.predicted(end.at)
+    return ends
+
+
+def _fits(end: _End, model: ResidualModel, lowest: float) -> bool:
+    """Return whether the values where an end begins, all but its own fitted again, fit as well by what was simulated since."""
+    assert end.begin is not None
+    end.begin, cost = model.cost().fitted(end.begin, np.delete(np.arange(len(end.begin), dtype=np.int64), end.k))
+    return cost < lowest + RISE
+
+
+def _others(ends: list[_End], model: ResidualModel, lowest: float, covariance: FloatArray) -> list[_End]:
+    """Return ends, not yet simulated, beyond the farthest ones: behind values that fit less well are others that do."""
+    rng, theta, cost = np.random.default_rng(0), model.point.theta, model.cost()
+    root = SPREAD * np.linalg.cholesky(covariance)
+    starts = [end.at for end in ends] + [theta + root @ rng.standard_normal(len(theta)) for _ in range(STARTS)]
+    found = []
+    for k in range(len(theta)):
+        for side in (-1.0, 1.0):
+            last = max((end for end in ends if end.k == k and side * end.reach > 0.0), key=lambda end: side * end.at[end.k])
+            reach = float(last.at[k] - theta[k])
+            if side * reach > 0.0 and (begin := cost.beyond(last.at, starts, lowest, k, reach, FARTHEST)) is not None:
+                found.append(_End(k, reach, begin, begin))
+    return found
 
 
 def _around(theta: FloatArray, directions: FloatArray) -> list[FloatArray]:
