@@ -16,6 +16,7 @@ from naibu.core.progress import ProgressReport
 from naibu.workflows.parallel.run_tasks import run_tasks
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers
+from naibu.workflows.parallel.worker_pool import WorkerPool
 
 TWO = Workers(2)
 
@@ -84,6 +85,39 @@ def test_workers_share_the_cores() -> None:
     outcomes = run_tasks([Task("threads", worker_tasks.threads_seen)] * 2, workers=TWO)
     each = max(1, usable_cores() // 2)
     assert [o.value() for o in outcomes] == [(each, str(each))] * 2
+
+
+def processes(pool: WorkerPool, count: int) -> list[int]:
+    tasks = [Task(f"process {k}", worker_tasks.own_process, {"seconds": 1.0}) for k in range(count)]
+    return [outcome.value() for outcome in run_tasks(tasks, workers=TWO, pool=pool)]
+
+
+def test_processes_of_a_pool_stay_for_the_next_tasks_and_end_with_it() -> None:
+    with WorkerPool() as pool:
+        first = processes(pool, 4)
+        assert len(set(first)) == 2
+        assert set(processes(pool, 2)) == set(first)
+    assert all(gone(pid) for pid in first)
+
+
+def test_a_pool_goes_on_after_a_death_and_after_an_interruption(tmp_path: Path) -> None:
+    """A process that died is replaced; after an interruption none is left that may still compute."""
+    pid_file = tmp_path / "pid"
+
+    def progress(report: ProgressReport) -> None:
+        if pid_file.is_file() and pid_file.read_text():
+            raise KeyboardInterrupt
+
+    with WorkerPool() as pool:
+        dying = Task("dying", worker_tasks.dying, {"times": 1, "counter": str(tmp_path / "begun")})
+        outcomes = run_tasks([dying, *squares(2)], workers=TWO, pool=pool)
+        assert [o.value() for o in outcomes] == [2, 0, 1] and outcomes[0].attempts == 2
+        before = processes(pool, 2)
+        sleeping = Task("sleeping", worker_tasks.sleeping, {"seconds": 600.0, "pid_file": str(pid_file)})
+        with pytest.raises(KeyboardInterrupt):
+            run_tasks([sleeping] * 2, workers=TWO, pool=pool, progress=progress)
+        assert all(gone(pid) for pid in before)
+        assert [o.value() for o in run_tasks(squares(2), workers=TWO, pool=pool)] == [0.0, 1.0]
 
 
 def test_an_interruption_ends_the_workers_and_keeps_what_is_finished(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from naibu.io.images import can_be_opened, open_volume, read_volume
 from naibu.workflows.parallel.run_tasks import run_tasks
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers
+from naibu.workflows.parallel.worker_pool import WorkerPool
 
 T = TypeVar("T")
 _HEAD = "measurement.json"
@@ -72,14 +73,17 @@ class BlockCheckpoint:
         Reference and deformed volume, and the mask or None.
     workers : Workers
         Where blocks are computed.
+    pool : WorkerPool
+        Processes that stay from one pass through the volumes to the next.
     memory_mb : float
         Memory that one block takes, MB.
     progress : callable, optional
         Progress over the blocks of a stage.
     """
 
-    def __init__(self, folder: Path, pair: Stored, workers: Workers, memory_mb: float, progress: Progress | None) -> None:
-        self.folder, self._pair, self._workers, self._memory_mb, self._progress = folder, pair, workers, memory_mb, progress
+    def __init__(self, folder: Path, pair: Stored, workers: Workers, pool: WorkerPool, memory_mb: float, progress: Progress | None) -> None:
+        self.folder, self._pair, self._workers, self._pool = folder, pair, workers, pool
+        self._memory_mb, self._progress = memory_mb, progress
 
     def begin(self, of: dict[str, Any], plan: dict[str, Any], *, resume: bool, overwrite: bool) -> dict[str, Any]:
         """Make the folder, or check that it is that of the same measurement, and return the plan of that.
@@ -148,7 +152,8 @@ class BlockCheckpoint:
             if not path.is_file()
         ]
         run_tasks(
-            tasks, workers=self._workers, memory_mb=self._memory_mb, stage=name, finished=_raise_what_failed, progress=self._progress
+            tasks, workers=self._workers, memory_mb=self._memory_mb, stage=name, finished=_raise_what_failed, progress=self._progress,
+            pool=self._pool,
         )  # fmt: skip
         for path in paths:
             yield _loaded(path)

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
 from threading import Thread
 
-from naibu.core.cores import usable_cores
 from naibu.core.errors import WorkerLostError
 from naibu.core.progress import Progress, ProgressReport, report_progress
 from naibu.workflows.parallel.cluster import submitted
 from naibu.workflows.parallel.local_worker import LocalWorker, WorkerDiedError
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import HERE, Workers
+from naibu.workflows.parallel.worker_pool import WorkerPool
 
 ATTEMPTS = 2  # at a task whose worker dies
 _REPEAT_S = 1.0  # between reports of progress where nothing happens, so that a stop is noticed
@@ -27,6 +27,7 @@ def run_tasks(
     stage: str = "tasks",
     finished: Callable[[int, Outcome], None] | None = None,
     progress: Progress | None = None,
+    pool: WorkerPool | None = None,
 ) -> list[Outcome]:
     """Compute tasks, and return what became of each, in their order.
 
@@ -47,6 +48,8 @@ def run_tasks(
         Called in this thread with the index and the outcome of every task, when it is finished.
     progress : callable, optional
         Called in this thread with the progress over all tasks (`naibu.core.progress`).
+    pool : WorkerPool, optional
+        Whose processes compute the tasks, and stay for later ones; by default processes of their own.
 
     Raises
     ------
@@ -63,7 +66,12 @@ def run_tasks(
         with submitted(tasks, workers.cluster) as messages:
             overall.follow(messages)
     elif workers.elsewhere:
-        _run_here(tasks, workers.processes(len(tasks), memory_mb), overall)
+        count = workers.processes(len(tasks), memory_mb)
+        if pool is not None:
+            _run_here(tasks, count, overall, pool)
+        else:
+            with WorkerPool() as own:
+                _run_here(tasks, count, overall, own)
     else:
         for index, task in enumerate(tasks):
             overall.take(index, _attempted(task, overall.reporter(index)))
@@ -112,20 +120,16 @@ class _Overall:
                 self.report()
 
 
-def _run_here(tasks: Sequence[Task], count: int, overall: _Overall) -> None:
+def _run_here(tasks: Sequence[Task], count: int, overall: _Overall, pool: WorkerPool) -> None:
     """Let processes of this computer compute the tasks, each served by a thread."""
     waiting: SimpleQueue[int] = SimpleQueue()
     for index in range(len(tasks)):
         waiting.put(index)
     messages: SimpleQueue[Message] = SimpleQueue()
-    pool = [LocalWorker(max(1, usable_cores() // count)) for _ in range(count)]
-    for worker in pool:
-        Thread(target=_serve, args=(worker, tasks, waiting, messages), daemon=True).start()
-    try:
+    with pool.lent(count) as lent:
+        for worker in lent:
+            Thread(target=_serve, args=(worker, tasks, waiting, messages), daemon=True).start()
         overall.follow(messages)
-    finally:
-        for worker in pool:
-            worker.stop()
 
 
 def _serve(worker: LocalWorker, tasks: Sequence[Task], waiting: SimpleQueue[int], messages: SimpleQueue[Message]) -> None:
