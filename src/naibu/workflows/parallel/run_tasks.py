@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from queue import Empty, SimpleQueue
 from threading import Thread
 
@@ -27,7 +27,6 @@ def run_tasks(
     stage: str = "tasks",
     finished: Callable[[int, Outcome], None] | None = None,
     progress: Progress | None = None,
-    pool: WorkerPool | None = None,
 ) -> list[Outcome]:
     """Compute tasks, and return what became of each, in their order.
 
@@ -48,8 +47,6 @@ def run_tasks(
         Called in this thread with the index and the outcome of every task, when it is finished.
     progress : callable, optional
         Called in this thread with the progress over all tasks (`naibu.core.progress`).
-    pool : WorkerPool, optional
-        Whose processes compute the tasks, and stay for later ones; by default processes of their own.
 
     Raises
     ------
@@ -58,24 +55,47 @@ def run_tasks(
     MissingDependencyError
         A cluster without the package ``distributed``.
     """
+    return list(outcomes_in_order(tasks, workers, memory_mb=memory_mb, stage=stage, finished=finished, progress=progress))
+
+
+def outcomes_in_order(
+    tasks: Sequence[Task],
+    workers: Workers,
+    *,
+    memory_mb: float,
+    stage: str,
+    finished: Callable[[int, Outcome], None] | None = None,
+    progress: Progress | None = None,
+    pool: WorkerPool | None = None,
+) -> Generator[Outcome, None, None]:
+    """Yield what became of each task, in their order: what is done with it is done while workers compute the next ones.
+
+    Parameters
+    ----------
+    tasks, workers, memory_mb, stage, finished, progress
+        As of `run_tasks`, which tells also what is raised.
+    pool : WorkerPool, optional
+        Whose processes compute the tasks, and stay for later ones; by default processes of their own. Closing the iterator before its end
+        ends them.
+    """
     overall = _Overall(tasks, stage, finished, progress)
     overall.report()
     if not tasks:
-        return []
+        return
     if workers.cluster is not None:
         with submitted(tasks, workers.cluster) as messages:
-            overall.follow(messages)
+            yield from overall.follow(messages)
     elif workers.elsewhere:
         count = workers.processes(len(tasks), memory_mb)
         if pool is not None:
-            _run_here(tasks, count, overall, pool)
+            yield from _run_here(tasks, count, overall, pool)
         else:
             with WorkerPool() as own:
-                _run_here(tasks, count, overall, own)
+                yield from _run_here(tasks, count, overall, own)
     else:
         for index, task in enumerate(tasks):
             overall.take(index, _attempted(task, overall.reporter(index)))
-    return [overall.outcomes[index] for index in range(len(tasks))]
+            yield overall.outcomes[index]
 
 
 class _Overall:
@@ -111,16 +131,18 @@ class _Overall:
         share = gone / sum(lengths) if len(set(lengths)) > 1 else None
         report_progress(self._progress, self._stage, done=done, total=len(self._tasks), share=share)
 
-    def follow(self, messages: SimpleQueue[Message]) -> None:
-        """Take messages until all tasks are finished."""
-        while len(self.outcomes) < len(self._tasks):
-            try:
-                self.take(*messages.get(timeout=_REPEAT_S))
-            except Empty:
-                self.report()
+    def follow(self, messages: SimpleQueue[Message]) -> Generator[Outcome, None, None]:
+        """Take messages until all tasks are finished; yield the outcomes in the order of the tasks."""
+        for index in range(len(self._tasks)):
+            while index not in self.outcomes:
+                try:
+                    self.take(*messages.get(timeout=_REPEAT_S))
+                except Empty:
+                    self.report()
+            yield self.outcomes[index]
 
 
-def _run_here(tasks: Sequence[Task], count: int, overall: _Overall, pool: WorkerPool) -> None:
+def _run_here(tasks: Sequence[Task], count: int, overall: _Overall, pool: WorkerPool) -> Generator[Outcome, None, None]:
     """Let processes of this computer compute the tasks, each served by a thread."""
     waiting: SimpleQueue[int] = SimpleQueue()
     for index in range(len(tasks)):
@@ -129,7 +151,7 @@ def _run_here(tasks: Sequence[Task], count: int, overall: _Overall, pool: Worker
     with pool.lent(count) as lent:
         for worker in lent:
             Thread(target=_serve, args=(worker, tasks, waiting, messages), daemon=True).start()
-        overall.follow(messages)
+        yield from overall.follow(messages)
 
 
 def _serve(worker: LocalWorker, tasks: Sequence[Task], waiting: SimpleQueue[int], messages: SimpleQueue[Message]) -> None:
