@@ -53,3 +53,9 @@ def killed_at(
     if np.array_equal(arguments[name], value):
         dying(times, counter, progress)
     return function(**arguments, progress=progress)
+
+
+def own_process(seconds: float, progress: Progress | None) -> int:
+    """Return the process's number after a while, in which another process takes the next task."""
+    time.sleep(seconds)
+    return os.getpid()

@@ -102,7 +102,7 @@ def test_reactions_balance(surface, mu):
 
 
 def test_a_body_that_nothing_holds_is_told():
-    mesh = block()
+    mesh = block(2)
     weight = np.tile([0.0, 0.0, -1.0], (mesh.n_points, 1))
     assert solve(problem(mesh, force=weight), throw=False).status is Status.SINGULAR
     with pytest.raises(ConvergenceError, match="can move freely"):

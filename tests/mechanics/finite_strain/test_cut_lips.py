@@ -254,7 +254,7 @@ def test_a_live_body_cut_and_pressed_carries_the_pressure():
 
 
 @pytest.mark.parametrize(("height", "tilt", "n"), [(0.6, 0.0, 5), (0.45, 4.0, 5)])
-@pytest.mark.parametrize("ratio", [0.3, 0.45, 0.49])
+@pytest.mark.parametrize("ratio", [pytest.param(0.3, marks=pytest.mark.slow), 0.45, 0.49])
 def test_how_much_too_soft_a_body_between_walls_is_behind_a_cut_is_said(height, tilt, n, ratio):
     """Between walls a cut block resists as the whole one; what it lacks while a pressure rises fast is within what is said, and not far."""
     law = material("neo_hookean", young_modulus=10.0, poisson_ratio=ratio)

@@ -25,7 +25,7 @@ from naibu.meshing.surface import faces_among, faces_towards, node_areas
 
 PATH = SolverSettings(first_step=0.1, largest_step=0.1, tolerance=1e-12, max_iterations=40)
 SIZE = 20.0
-MESH = box((SIZE, SIZE, SIZE), (4, 4, 4), layers=[("low", 10), ("high", 10)])
+MESH = box((SIZE, SIZE, SIZE), (3, 3, 4), layers=[("low", 10), ("high", 10)])
 MATERIALS = (GEL, of("neo_hookean", 0.4, 35.0))
 TILT = np.array([0.02, -0.03, 0.01])
 

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Generator
 from functools import partial
 from pathlib import Path
 
@@ -12,10 +13,11 @@ import worker_tasks
 
 from naibu.core.cores import usable_cores
 from naibu.core.errors import ConvergenceError, InputError, WorkerLostError
-from naibu.core.progress import ProgressReport
-from naibu.workflows.parallel.run_tasks import run_tasks
+from naibu.core.progress import Progress, ProgressReport
+from naibu.workflows.parallel.run_tasks import outcomes_in_order, run_tasks
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers
+from naibu.workflows.parallel.worker_pool import WorkerPool
 
 TWO = Workers(2)
 
@@ -84,6 +86,56 @@ def test_workers_share_the_cores() -> None:
     outcomes = run_tasks([Task("threads", worker_tasks.threads_seen)] * 2, workers=TWO)
     each = max(1, usable_cores() // 2)
     assert [o.value() for o in outcomes] == [(each, str(each))] * 2
+
+
+def pooled(tasks: list[Task], pool: WorkerPool, progress: Progress | None = None) -> Generator[Outcome, None, None]:
+    return outcomes_in_order(tasks, TWO, memory_mb=100.0, stage="tasks", progress=progress, pool=pool)
+
+
+def processes(pool: WorkerPool, count: int) -> list[int]:
+    tasks = [Task(f"process {k}", worker_tasks.own_process, {"seconds": 1.0}) for k in range(count)]
+    return [outcome.value() for outcome in pooled(tasks, pool)]
+
+
+def test_processes_of_a_pool_stay_for_the_next_tasks_and_end_with_it() -> None:
+    with WorkerPool() as pool:
+        first = processes(pool, 4)
+        assert len(set(first)) == 2
+        assert set(processes(pool, 2)) == set(first)
+    assert all(gone(pid) for pid in first)
+
+
+def test_a_pool_goes_on_after_a_death_and_after_an_interruption(tmp_path: Path) -> None:
+    """A process that died is replaced; after an interruption none is left that may still compute."""
+    pid_file = tmp_path / "pid"
+
+    def progress(report: ProgressReport) -> None:
+        if pid_file.is_file() and pid_file.read_text():
+            raise KeyboardInterrupt
+
+    with WorkerPool() as pool:
+        dying = Task("dying", worker_tasks.dying, {"times": 1, "counter": str(tmp_path / "begun")})
+        outcomes = list(pooled([dying, *squares(2)], pool))
+        assert [o.value() for o in outcomes] == [2, 0, 1] and outcomes[0].attempts == 2
+        before = processes(pool, 2)
+        sleeping = Task("sleeping", worker_tasks.sleeping, {"seconds": 600.0, "pid_file": str(pid_file)})
+        with pytest.raises(KeyboardInterrupt):
+            list(pooled([sleeping] * 2, pool, progress))
+        assert all(gone(pid) for pid in before)
+        assert [o.value() for o in pooled(squares(2), pool)] == [0.0, 1.0]
+
+
+def test_outcomes_can_be_used_while_later_tasks_are_computed(tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    sleeping = Task("sleeping", worker_tasks.sleeping, {"seconds": 600.0, "pid_file": str(pid_file)})
+    with WorkerPool() as pool:
+        outcomes = pooled([*squares(3), sleeping], pool)
+        assert [next(outcomes).value() for _ in range(3)] == [0.0, 1.0, 4.0]
+        end = time.monotonic() + 60.0
+        while not (pid_file.is_file() and pid_file.read_text()) and time.monotonic() < end:
+            time.sleep(0.05)
+        outcomes.close()  # nobody wants the others
+        assert gone(int(pid_file.read_text()))
 
 
 def test_an_interruption_ends_the_workers_and_keeps_what_is_finished(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -23,9 +24,10 @@ from naibu.imaging import large_volumes
 from naibu.io.files.atomic import write_atomically
 from naibu.io.files.object_archive import packed, unpacked
 from naibu.io.images import can_be_opened, open_volume, read_volume
-from naibu.workflows.parallel.run_tasks import run_tasks
+from naibu.workflows.parallel.run_tasks import outcomes_in_order
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import Workers
+from naibu.workflows.parallel.worker_pool import WorkerPool
 
 T = TypeVar("T")
 _HEAD = "measurement.json"
@@ -72,14 +74,17 @@ class BlockCheckpoint:
         Reference and deformed volume, and the mask or None.
     workers : Workers
         Where blocks are computed.
+    pool : WorkerPool
+        Processes that stay from one pass through the volumes to the next.
     memory_mb : float
         Memory that one block takes, MB.
     progress : callable, optional
         Progress over the blocks of a stage.
     """
 
-    def __init__(self, folder: Path, pair: Stored, workers: Workers, memory_mb: float, progress: Progress | None) -> None:
-        self.folder, self._pair, self._workers, self._memory_mb, self._progress = folder, pair, workers, memory_mb, progress
+    def __init__(self, folder: Path, pair: Stored, workers: Workers, pool: WorkerPool, memory_mb: float, progress: Progress | None) -> None:
+        self.folder, self._pair, self._workers, self._pool = folder, pair, workers, pool
+        self._memory_mb, self._progress = memory_mb, progress
 
     def begin(self, of: dict[str, Any], plan: dict[str, Any], *, resume: bool, overwrite: bool) -> dict[str, Any]:
         """Make the folder, or check that it is that of the same measurement, and return the plan of that.
@@ -123,7 +128,8 @@ class BlockCheckpoint:
 
     def with_deformed(self, deformed: StoredVolume) -> BlockCheckpoint:
         """Return the same, with blocks of another deformed volume."""
-        return BlockCheckpoint(self.folder, (self._pair[0], deformed, self._pair[2]), self._workers, self._memory_mb, self._progress)
+        pair = self._pair[0], deformed, self._pair[2]
+        return BlockCheckpoint(self.folder, pair, self._workers, self._pool, self._memory_mb, self._progress)
 
     def kept(self, name: str, compute: Callable[[], T]) -> T:
         """Return what was kept under a name, or compute it and keep it; the blocks of that name are then no longer needed."""
@@ -136,12 +142,16 @@ class BlockCheckpoint:
         return value
 
     def each(self, name: str, function: Callable[..., T], shared: Sequence[Any], items: Sequence[Any]) -> Iterator[T]:
-        """Yield ``function(reference, deformed, mask, *shared, item)`` for all items, in their order; but for those that were kept."""
+        """Yield ``function(reference, deformed, mask, *shared, item)`` for all items, in their order, while workers compute later ones.
+
+        What was kept of an interrupted run is not computed again.
+        """
         place = self.folder / name
         common = place / "shared.npz"
         if not common.is_file():
             write_atomically(common, packed(tuple(shared)))
         paths = [place / f"{k:06d}.npz" for k in range(len(items))]
+        there = {path for path in paths if path.is_file()}
         tasks = [
             Task(
                 f"{name}, block {k + 1}",
@@ -149,13 +159,17 @@ class BlockCheckpoint:
                 {"pair": self._pair, "function": function, "common": common, "item": item, "path": path},
             )
             for k, (item, path) in enumerate(zip(items, paths, strict=True))
-            if not path.is_file()
+            if path not in there
         ]
-        run_tasks(
-            tasks, workers=self._workers, memory_mb=self._memory_mb, stage=name, finished=_raise_what_failed, progress=self._progress
+        outcomes = outcomes_in_order(
+            tasks, self._workers, memory_mb=self._memory_mb, stage=name, finished=_raise_what_failed, progress=self._progress,
+            pool=self._pool,
         )  # fmt: skip
-        for path in paths:
-            yield _loaded(path)
+        with closing(outcomes):
+            for path in paths:
+                if path not in there:
+                    next(outcomes)
+                yield _loaded(path)
 
     def forget(self) -> None:
         """Remove the folder of a measurement that was refused before anything was computed: there is nothing to resume."""

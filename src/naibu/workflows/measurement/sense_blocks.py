@@ -32,6 +32,7 @@ from naibu.workflows.measurement.block_checkpoint import BlockCheckpoint, Stored
 from naibu.workflows.measurement.multiscale_results import FILES as LEVELS
 from naibu.workflows.measurement.sense import FILES, Pair, SenseRun, common_points, recorded
 from naibu.workflows.parallel.worker_count import Workers
+from naibu.workflows.parallel.worker_pool import WorkerPool
 from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 
 STORES = ("displacement.zarr", "standard_deviation.zarr", "mask.zarr")
@@ -175,22 +176,23 @@ def sense_blocks(
     told = _told_grids(a, b, opened["deformed_mask"])
     plan = plan or MemoryPlan.of(a.shape, None, max(1, workers))
     points = None if check_points is None else common_points(*check_points)
-    kept = BlockCheckpoint(
-        Path(out) / CHECKPOINT, (_stored(reference, spacing_mm), _stored(deformed, spacing_mm), stored["mask"]), where,
-        BASE_MB + BLOCK_BYTES * plan.edge**3 / 2.0**20, progress,
-    )  # fmt: skip
-    folder = output_folder(out, () if resume else (*FILES, *STORES, *(LEVELS if multiscale else ())), overwrite=overwrite)
-    of = {role: _identity(path, opened[role]) for role, path in paths.items() if path is not None}
-    used = kept.begin(of, {"factor": plan.factor, "edge": plan.edge}, resume=resume, overwrite=overwrite)
-    scans = b, opened["deformed_mask"]
-    if told:
-        kept, scans = _on_reference_grid(kept, a, *scans)
-    try:
-        found = correlate_blocks(a, scans[0], mask=opened["mask"], deformed_mask=scans[1], **used, runner=kept, progress=progress)
-    except InputError:
-        kept.forget()
-        raise
-    stores = _written(found, a, kept, folder)
+    with WorkerPool() as pool:
+        kept = BlockCheckpoint(
+            Path(out) / CHECKPOINT, (_stored(reference, spacing_mm), _stored(deformed, spacing_mm), stored["mask"]), where, pool,
+            BASE_MB + BLOCK_BYTES * plan.edge**3 / 2.0**20, progress,
+        )  # fmt: skip
+        folder = output_folder(out, () if resume else (*FILES, *STORES, *(LEVELS if multiscale else ())), overwrite=overwrite)
+        of = {role: _identity(path, opened[role]) for role, path in paths.items() if path is not None}
+        used = kept.begin(of, {"factor": plan.factor, "edge": plan.edge}, resume=resume, overwrite=overwrite)
+        scans = b, opened["deformed_mask"]
+        if told:
+            kept, scans = _on_reference_grid(kept, a, *scans)
+        try:
+            found = correlate_blocks(a, scans[0], mask=opened["mask"], deformed_mask=scans[1], **used, runner=kept, progress=progress)
+        except InputError:
+            kept.forget()
+            raise
+        stores = _written(found, a, kept, folder)
     report_progress(progress, "page and figures")
     inputs = input_record({role: path for role, path in paths.items() if path is not None})
     notes = (told,) if told else ()

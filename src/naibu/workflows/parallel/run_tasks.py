@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from queue import Empty, SimpleQueue
 from threading import Thread
 
-from naibu.core.cores import usable_cores
 from naibu.core.errors import WorkerLostError
 from naibu.core.progress import Progress, ProgressReport, report_progress
 from naibu.workflows.parallel.cluster import submitted
 from naibu.workflows.parallel.local_worker import LocalWorker, WorkerDiedError
 from naibu.workflows.parallel.task import Outcome, Task
 from naibu.workflows.parallel.worker_count import HERE, Workers
+from naibu.workflows.parallel.worker_pool import WorkerPool
 
 ATTEMPTS = 2  # at a task whose worker dies
 _REPEAT_S = 1.0  # between reports of progress where nothing happens, so that a stop is noticed
@@ -55,19 +55,47 @@ def run_tasks(
     MissingDependencyError
         A cluster without the package ``distributed``.
     """
+    return list(outcomes_in_order(tasks, workers, memory_mb=memory_mb, stage=stage, finished=finished, progress=progress))
+
+
+def outcomes_in_order(
+    tasks: Sequence[Task],
+    workers: Workers,
+    *,
+    memory_mb: float,
+    stage: str,
+    finished: Callable[[int, Outcome], None] | None = None,
+    progress: Progress | None = None,
+    pool: WorkerPool | None = None,
+) -> Generator[Outcome, None, None]:
+    """Yield what became of each task, in their order: what is done with it is done while workers compute the next ones.
+
+    Parameters
+    ----------
+    tasks, workers, memory_mb, stage, finished, progress
+        As of `run_tasks`, which tells also what is raised.
+    pool : WorkerPool, optional
+        Whose processes compute the tasks, and stay for later ones; by default processes of their own. Closing the iterator before its end
+        ends them.
+    """
     overall = _Overall(tasks, stage, finished, progress)
     overall.report()
     if not tasks:
-        return []
+        return
     if workers.cluster is not None:
         with submitted(tasks, workers.cluster) as messages:
-            overall.follow(messages)
+            yield from overall.follow(messages)
     elif workers.elsewhere:
-        _run_here(tasks, workers.processes(len(tasks), memory_mb), overall)
+        count = workers.processes(len(tasks), memory_mb)
+        if pool is not None:
+            yield from _run_here(tasks, count, overall, pool)
+        else:
+            with WorkerPool() as own:
+                yield from _run_here(tasks, count, overall, own)
     else:
         for index, task in enumerate(tasks):
             overall.take(index, _attempted(task, overall.reporter(index)))
-    return [overall.outcomes[index] for index in range(len(tasks))]
+            yield overall.outcomes[index]
 
 
 class _Overall:
@@ -103,29 +131,27 @@ class _Overall:
         share = gone / sum(lengths) if len(set(lengths)) > 1 else None
         report_progress(self._progress, self._stage, done=done, total=len(self._tasks), share=share)
 
-    def follow(self, messages: SimpleQueue[Message]) -> None:
-        """Take messages until all tasks are finished."""
-        while len(self.outcomes) < len(self._tasks):
-            try:
-                self.take(*messages.get(timeout=_REPEAT_S))
-            except Empty:
-                self.report()
+    def follow(self, messages: SimpleQueue[Message]) -> Generator[Outcome, None, None]:
+        """Take messages until all tasks are finished; yield the outcomes in the order of the tasks."""
+        for index in range(len(self._tasks)):
+            while index not in self.outcomes:
+                try:
+                    self.take(*messages.get(timeout=_REPEAT_S))
+                except Empty:
+                    self.report()
+            yield self.outcomes[index]
 
 
-def _run_here(tasks: Sequence[Task], count: int, overall: _Overall) -> None:
+def _run_here(tasks: Sequence[Task], count: int, overall: _Overall, pool: WorkerPool) -> Generator[Outcome, None, None]:
     """Let processes of this computer compute the tasks, each served by a thread."""
     waiting: SimpleQueue[int] = SimpleQueue()
     for index in range(len(tasks)):
         waiting.put(index)
     messages: SimpleQueue[Message] = SimpleQueue()
-    pool = [LocalWorker(max(1, usable_cores() // count)) for _ in range(count)]
-    for worker in pool:
-        Thread(target=_serve, args=(worker, tasks, waiting, messages), daemon=True).start()
-    try:
-        overall.follow(messages)
-    finally:
-        for worker in pool:
-            worker.stop()
+    with pool.lent(count) as lent:
+        for worker in lent:
+            Thread(target=_serve, args=(worker, tasks, waiting, messages), daemon=True).start()
+        yield from overall.follow(messages)
 
 
 def _serve(worker: LocalWorker, tasks: Sequence[Task], waiting: SimpleQueue[int], messages: SimpleQueue[Message]) -> None:
