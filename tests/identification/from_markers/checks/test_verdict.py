@@ -92,6 +92,14 @@ def test_a_uniform_deformation_is_explained_but_tells_little() -> None:
     assert found.explanation is Explanation.EXPLAINED and "tells little about materials" in found.notes[0]
 
 
+def test_a_stated_height_that_the_markers_contradict_somewhat_is_noted() -> None:
+    """A plate at 48 mm that was written down as at 41 mm, of 60 mm; and one that is off by no more than the noise."""
+    found = judged(case(), case(expected_mm=41.0, found_mm=48.1, name="box/more"))  # type: ignore[arg-type]
+    assert found.explanation is Explanation.EXPLAINED
+    assert len(found.notes) == 1 and "box/more is stated at 41 mm, but the markers put it at 48.1 mm" in found.notes[0]
+    assert judged(case(expected_mm=57.0, found_mm=56.5)).notes == ()  # type: ignore[arg-type]
+
+
 def test_estimates_far_from_what_was_known_count() -> None:
     found = judged(case(), deviations={"box: base_offset": -3.7, "a: friction": 2.9})
     assert found.explanation is Explanation.EXPLAINED and "base_offset lies 3.7 standard deviations" in " ".join(found.notes)
