@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations, product
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from naibu.identification.lattice_calibration.captured.recorded_forces import Re
 from naibu.identification.lattice_calibration.captured.sensor_errors import NO_ERRORS, SensorErrors
 from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
 from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import diagnosed, sensor_errors_found
+from naibu.identification.lattice_calibration.intervals.unnoticed_drift import unnoticed_drift
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
 from naibu.workflows.studies.lattice_study import prepared_study
@@ -94,11 +96,19 @@ def clean(times: FloatArray) -> FloatArray:
 
 
 def problem(
-    folder: Path, clean: FloatArray, times: FloatArray, seed: int, errors: SensorErrors, *, late_s: float = 0.0, offset: float = 0.0
+    folder: Path,
+    clean: FloatArray,
+    times: FloatArray,
+    seed: int,
+    errors: SensorErrors,
+    *,
+    late_s: float = 0.0,
+    offset: float = 0.0,
+    drift: float = 0.0,
 ) -> StudyProblem:
     study = prepared_study(study_file(folder, VOXEL)).study
     force = np.zeros((len(times), 3))
-    force[:, 2] = np.interp(times - late_s, *clean) + offset
+    force[:, 2] = np.interp(times - late_s, *clean) + offset + drift * times
     force += NOISE_MN * np.random.default_rng(seed).standard_normal(force.shape)
     recorded = RecordedForces.of(study, [(1, times, force)], sd_mn=NOISE_MN)
     return StudyProblem.of(StudyUnknowns.of(study, groups="all"), [], recorded, point_sd_mm=0.5, sensor_errors=errors)
@@ -166,6 +176,38 @@ def test_errors_that_were_not_sought_are_named_and_intervals_reach_the_truth(
     named = next(error for error in told.told if error.quantity == quantity)
     assert named.value == pytest.approx(late_s or offset, rel=0.2)
     assert told.factors[1] < 0.3 * told.factors[0]
+
+
+def test_a_drift_that_was_not_sought_is_named_though_parameters_take_up_most_of_it(
+    tmp_path: Path, clean: FloatArray, times: FloatArray
+) -> None:
+    """Creep resembles it: what is left is hardly more than noise, and C2 far outside of its interval."""
+    for seed in range(3):
+        made = problem(tmp_path, clean, times, seed, BOTH, drift=100.0)
+        found = calibrate_lattice(made, made.unknowns.start, threads=1)
+        low, high = found.intervals().T
+        assert not ((low < TRUTH) & (high > TRUTH)).all()
+        told = diagnosed(made, found)
+        assert told is not None and told.errors == SensorErrors(offset=True, drift=True, delay=True)
+        named = {error.quantity: error for error in told.told}
+        assert named["drift along z"].value == pytest.approx(100.0, abs=max(4.0 * named["drift along z"].sd, 40.0))
+        low, high = told.estimate.intervals().T
+        assert (low < TRUTH).all() and (high > TRUTH).all()
+
+
+def test_a_drift_that_forces_cannot_exclude_is_told_with_what_it_does(tmp_path: Path, clean: FloatArray, times: FloatArray) -> None:
+    """Against a record that has it: the same noise, and that drift added."""
+    made = problem(tmp_path, clean, times, 2, BOTH)
+    found = calibrate_lattice(made, made.unknowns.start, threads=1)
+    told = unnoticed_drift(made, found)
+    assert told is not None and told.body == "stamp" and told.axis == "z"
+    other = problem(tmp_path, clean, times, 2, BOTH, drift=told.drift_mn_per_s)
+    moved = calibrate_lattice(other, other.unknowns.start, threads=1)
+    assert moved.noise_factor[1] < 1.2  # nothing that would be noticed
+    k = found.unknowns.names.index(told.parameter)
+    assert abs(np.log(moved.values[k] / found.values[k])) == pytest.approx(np.log(told.factor), rel=0.35)
+    sought = replace(made, sensor_errors=SensorErrors(offset=True, drift=True, delay=True))
+    assert unnoticed_drift(sought, found) is None
 
 
 def test_forces_that_fit_are_not_diagnosed(tmp_path: Path, clean: FloatArray, times: FloatArray) -> None:

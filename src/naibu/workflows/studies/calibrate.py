@@ -21,7 +21,6 @@ from naibu.core.progress import Progress
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.captured.sensor_errors import NO_ERRORS, SensorErrorNames, SensorErrors
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
-from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import diagnosed, sensor_errors_found
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import PULL_OFF, Friction, Groups, StudyUnknowns
 from naibu.io.files.atomic import write_atomically
@@ -35,7 +34,7 @@ from naibu.viewer.notebook import WrittenResult
 from naibu.workflows.parallel.worker_count import Workers
 from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.studies.calibration_page import Compared, calibration_chapter, held_intervals, misfit_numbers, start_numbers
-from naibu.workflows.studies.calibration_sensors import sensor_warnings
+from naibu.workflows.studies.calibration_sensors import sensors_told
 from naibu.workflows.studies.calibration_starts import CalibratedFromStarts, Method, calibrate_from_starts, searched
 from naibu.workflows.studies.lattice_study import PreparedStudy, prepared_study
 
@@ -153,8 +152,7 @@ def calibrate_study(
         raise InputError(
             f"groups is {groups!r}, but the elements of {prepared.source} come from [material]; choose 'given', or write [parameters]"
         )
-    captured = read_captured_shapes(shapes) if shapes else ()
-    records = read_force_records(forces) if forces else ()
+    captured, records = read_captured_shapes(shapes) if shapes else (), read_force_records(forces) if forces else ()
     unknowns = StudyUnknowns.of(prepared.study, groups=groups, friction=friction, pull_off=pull_off)
     problem = _problem(prepared, unknowns, captured, records, point_sd_mm, force_sd_mn, SensorErrors.named(sensor_errors))
     name = f"{prepared.name}-calibrated.toml"
@@ -162,9 +160,7 @@ def calibrate_study(
     before = Compared.of(replace(problem, sensor_errors=NO_ERRORS), unknowns.start)
     _check_directions(prepared, before, tared=not problem.sensor_errors.offset)
     estimate, several = _searched(problem, starts, where, progress, method=method, seed=seed, max_runs=max_runs, threads=threads)
-    diagnosis = diagnosed(problem, estimate) if estimate.finished else None
-    estimate = diagnosis.estimate if diagnosis else estimate
-    sensors = sensor_errors_found(problem, estimate)
+    estimate, sensors, told = sensors_told(problem, estimate)
     after = Compared.of(problem, estimate.values)
     settings = calibrated_settings(prepared.settings, estimate)
     options: dict[str, str | float | int | None] = {
@@ -172,7 +168,11 @@ def calibrate_study(
         "starts": starts, "sensor_errors": sensor_errors,
         **{f"SHA-256 of {file}": digest for file, digest in {**prepared.inputs, **_hashes((*shapes, *forces))}.items()},
     }  # fmt: skip
-    warnings = (*_warnings_of_starts(several), *sensor_warnings(problem, diagnosis, sensors), *_warnings(problem, estimate, before))
+    warnings = (
+        *_warnings_of_starts(several),
+        *told,
+        *_warnings(problem, estimate, before),
+    )
     chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options, several, sensors)
     comment = f"{prepared.title}, calibrated by naibu {__version__} from {', '.join(map(_file_name, (*shapes, *forces)))}"
     target = write_atomically(folder / name, study_document(_with_volumes(prepared, settings, folder), comment))

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from naibu.identification.lattice_calibration.captured.sensor_errors import MOST_DELAY_S, SensorErrors
-from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import TOLD, SensorDiagnosis, SensorError
+from naibu.identification.lattice_calibration.estimate import LatticeEstimate
+from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import (
+    TOLD,
+    SensorDiagnosis,
+    SensorError,
+    diagnosed,
+    sensor_errors_found,
+)
+from naibu.identification.lattice_calibration.intervals.unnoticed_drift import UnnoticedDrift, unnoticed_drift
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.viewer.chapters.chapter import Section
 from naibu.viewer.tables import Table
@@ -17,16 +26,39 @@ LATE = 0.25  # of a window of time: a delay that is one
 AT_THE_END = 0.95  # of the longest delay that is sought
 
 
-def sensor_warnings(problem: StudyProblem, diagnosis: SensorDiagnosis | None, sensors: Sequence[SensorError]) -> tuple[str, ...]:
+def sensors_told(problem: StudyProblem, estimate: LatticeEstimate) -> tuple[LatticeEstimate, tuple[SensorError, ...], tuple[str, ...]]:
+    """Return an estimate whose intervals reach to where errors that were not sought would move it, errors that were found, and warnings."""
+    diagnosis = diagnosed(problem, estimate) if estimate.finished else None
+    unnoticed = unnoticed_drift(problem, estimate) if estimate.finished and not diagnosis else None
+    estimate = diagnosis.estimate if diagnosis else estimate
+    sensors = sensor_errors_found(problem, estimate)
+    return estimate, sensors, _warnings(problem, diagnosis, sensors, unnoticed)
+
+
+def _warnings(
+    problem: StudyProblem, diagnosis: SensorDiagnosis | None, sensors: Sequence[SensorError], unnoticed: UnnoticedDrift | None
+) -> tuple[str, ...]:
     """Return in words what a reader must know of the sensors."""
     found = []
-    if diagnosis:
-        named = ", ".join(f"{error} of {error.body}" for error in diagnosis.told) or "such errors"
+    if diagnosis and diagnosis.told:
+        named = ", ".join(f"{error} of {error.body}" for error in diagnosis.told)
         before, after = diagnosis.factors
         found.append(
             f"With {named} the forces would be met to {after:.3g} instead of {before:.3g} times their noise: "
             f"{_perhaps(diagnosis.errors)}; or the law lacks something that looks alike. Intervals reach to where that would move the "
             f"estimates. To estimate it along, set sensor_errors to {_name(diagnosis.errors)!r}."
+        )
+    elif diagnosis:
+        found.append(
+            f"Forces are met better with errors of their sensors ({_name(diagnosis.errors)}), too small to be told from noise: intervals "
+            f"reach to where these would move the estimates. To estimate them along, set sensor_errors to {_name(diagnosis.errors)!r}."
+        )
+    if unnoticed:
+        found.append(
+            f"Intervals hold if the sensors do not drift: a drift of {1e-3 * unnoticed.drift_mn_per_s:.2g} N/s on {unnoticed.axis} of "
+            f"{unnoticed.body} would hardly show in these forces, as creep looks alike, and would make {unnoticed.parameter} wrong by a "
+            f"factor of {unnoticed.factor:.3g}. Where a sensor may drift so, set sensor_errors to "
+            f"{_name(replace(problem.sensor_errors, offset=True, drift=True))!r}."
         )
     for error in sensors:
         if abs(error.value) > TOLD * error.sd and _matters(problem, error):
@@ -47,8 +79,7 @@ def sensor_section(sensors: Sequence[SensorError]) -> tuple[Section, ...]:
     rows = tuple((e.body, e.quantity, e.value, e.value - 1.96 * e.sd, e.value + 1.96 * e.sd, e.unit) for e in sensors)
     text = (
         "Errors of the force sensors were estimated along with the parameters, whose intervals count them. Where a sensor was tared, and "
-        "its clock is that of the indenters, sensor_errors = none makes intervals shorter. In contact, with many unknowns, intervals "
-        "beside these errors can be too short: compare with those of none, and rely on the longer ones. A wrong gain of a sensor cannot "
+        "its clock is that of the indenters, sensor_errors = none makes intervals shorter. A wrong gain of a sensor cannot "
         "be told from stiffness, nor a slow drift from creep."
     )
     table = Table("Errors of the force sensors", ("indenter", "error", "estimate", "95 % from", "to", "unit"), rows)

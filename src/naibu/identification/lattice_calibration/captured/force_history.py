@@ -75,6 +75,20 @@ class SampledMeans:
 
     def __call__(self, delay: float) -> tuple[FloatArray, FloatArray]:
         """Return means (windows, q, 3) of a force that is seen later by a delay, s, and their derivatives by it."""
+        means, rates = self._of_steps(delay)
+        before, after = self._limited(means[:, :1])
+        of_means, of_rates = (self._windows(of + before * _before(of) + after * _after(of)) for of in (means, rates))
+        return of_means, of_rates
+
+    def doubtful(self, delay: float) -> FloatArray:
+        """Return what means (windows, q, 3) would change by, could forces not jump: if they change evenly from step to step."""
+        means = self._of_steps(delay)[0]
+        before, after = self._limited(means[:, :1])
+        evenly = 0.5 * self.phase[:, None, None]
+        return self._windows((evenly - before) * _before(means) + (evenly - after) * _after(means))
+
+    def _of_steps(self, delay: float) -> tuple[FloatArray, FloatArray]:
+        """Return means (m, q, 3) over fine steps, and their derivatives by the delay."""
         asked = self.times - delay
         inside = np.clip(asked, self.borders[0], self.borders[-1])
         k = np.clip(np.searchsorted(self.borders, inside, side="right") - 1, 0, len(self.borders) - 2)
@@ -86,9 +100,7 @@ class SampledMeans:
         force = (left + 2.0 * u * (3.0 * rise - 2.0 * left - right) + 3.0 * u**2 * (left + right - 2.0 * rise)) / each
         impulse = impulse + (asked - inside)[:, None, None] * force
         step = self.times[1] - self.times[0]
-        means, rates = np.diff(impulse, axis=0) / step, -np.diff(force, axis=0) / step
-        before, after = self._limited(means[:, :1])
-        return tuple(self._windows(of + before * _before(of) + after * _after(of)) for of in (means, rates))
+        return np.diff(impulse, axis=0) / step, -np.diff(force, axis=0) / step
 
     def _limited(self, force: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return what differences of a force (m, 1, 3) from the steps before and after count by until the samples are taken."""

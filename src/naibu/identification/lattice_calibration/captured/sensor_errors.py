@@ -101,7 +101,7 @@ class BodyResiduals:
     delay_slopes : ndarray, shape (p,)
         How it changes with the parameters.
     delay_variance : float
-        At known parameters.
+        At known parameters; with how far it may be off because samples are not taken in the middle of steps.
     """
 
     counted: BoolArray
@@ -153,13 +153,13 @@ def body_residuals(
     def without(rows: FloatArray) -> FloatArray:
         return rows - basis @ (basis.T @ rows)
 
-    delay, rate = 0.0, np.zeros_like(seen)
+    delay, rate, doubtful = 0.0, np.zeros_like(seen), np.zeros_like(seen)
     if history is not None and (errors.delay or np.abs(record.phase_s[:, body]).max() > EXACT_S):
 
         def cost(means: FloatArray) -> float:
             return float((without(weight * (means - seen)[counted]) ** 2).sum())
 
-        delay, means, means_change, rate = _sampled(record, body, history, cost if errors.delay else None)
+        delay, means, means_change, rate, doubtful = _sampled(record, body, history, cost if errors.delay else None)
     raw, raw_slopes = weight * (means - seen)[counted], weight * means_change[:, counted]
     residual, slopes = without(raw), raw_slopes - basis @ (basis.T @ raw_slopes)
     along, stiffness = without(weight * rate[counted]) * float(errors.delay), DELAY_SD_S**-2
@@ -173,14 +173,17 @@ def body_residuals(
     explained = -(back @ basis.T @ raw)
     return BodyResiduals(
         counted, residual, slopes, explained, explained_slopes, spread, means, seen[counted] - design @ explained, delay, delay_slopes,
-        variance if errors.delay else 0.0,
+        variance + (variance * float((along * weight * doubtful[counted]).sum())) ** 2 if errors.delay else 0.0,
     )  # fmt: skip
 
 
 def _sampled(
     record: RecordedForces, body: int, history: ForceHistory, cost: Callable[[FloatArray], float] | None
-) -> tuple[float, FloatArray, FloatArray, FloatArray]:
-    """Return the delay of least cost of means (windows, 3), 0 without a cost; the means, and their derivatives by all else and by it."""
+) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return the delay of the least cost of means (windows, 3), 0 without a cost, and the means there.
+
+    Then follow their derivatives by all else and by it, and what of them is in doubt because samples are not in the middle of steps.
+    """
     sampled = partial(
         SampledMeans.of,
         shares=record.shares[:, body],
@@ -193,7 +196,8 @@ def _sampled(
         late = sampled(history.borders, force)
         delay = _best_delay(lambda tau: cost(late(tau)[0][:, 0]))
     means, rate = sampled(history.borders, np.concatenate([force, history.change[:, :, body].transpose(1, 0, 2)], axis=1))(delay)
-    return delay, means[:, 0], means[:, 1:].transpose(1, 0, 2), rate[:, 0]
+    doubtful = sampled(history.borders, force).doubtful(delay)[:, 0]
+    return delay, means[:, 0], means[:, 1:].transpose(1, 0, 2), rate[:, 0], doubtful
 
 
 def _best_delay(cost: Callable[[float], float]) -> float:

@@ -18,7 +18,8 @@ from naibu.identification.lattice_calibration.least_squares import about, unsett
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 
 CANDIDATES = tuple(SensorErrors(*map(bool, each)) for each in ((1, 0, 0), (0, 0, 1), (1, 0, 1), (1, 1, 0), (1, 1, 1)))
-CHANCE = 1e-3  # of an F-test, below which errors are told
+CHANCE = 0.05  # of an F-test, below which errors are told
+MOVES = 0.5  # standard deviations by which an estimate must move, or its standard deviation grow, for errors to be told
 EXPLAINED = 0.25  # of what the mean square of residuals is above that of noise, from which on errors are told
 # fewer errors are preferred that leave no more than that many times the sum of squares that the best ones leave, and of what there was
 AS_WELL, NEGLIGIBLE = 1.1, 0.005
@@ -77,10 +78,20 @@ class SensorDiagnosis:
 
 
 def sensor_errors_found(problem: StudyProblem, estimate: LatticeEstimate) -> tuple[SensorError, ...]:
-    """Return the errors of all sensors at the values of an estimate, as far as the problem seeks them."""
+    """Return the errors of all sensors at the values of an estimate, as far as the problem seeks them.
+
+    Standard deviations count as well what steps of time leave: twice what errors differ by with half steps (:cite:t:`richardson1911`).
+    """
     if not problem.sensor_errors.any or not len(problem.load_cases[0].forces.force):
         return ()
-    return _listed(problem, _at(problem, estimate), estimate.covariance, max(estimate.noise_factor[1], 1.0) ** 2)
+    listed = _listed(problem, at_estimate(problem, estimate), estimate.covariance, max(estimate.noise_factor[1], 1.0) ** 2)
+    if (halved := problem.with_half_steps()) is None:
+        return listed
+    finer = halved.load_cases[0].fine.run(problem.unknowns.parameters(estimate.values))
+    others = _listed(halved, finer, np.zeros((0, 0)), 1.0)
+    return tuple(
+        replace(own, sd=float(np.hypot(own.sd, 2.0 * (own.value - other.value)))) for own, other in zip(listed, others, strict=True)
+    )
 
 
 def diagnosed(problem: StudyProblem, estimate: LatticeEstimate) -> SensorDiagnosis | None:
@@ -89,15 +100,18 @@ def diagnosed(problem: StudyProblem, estimate: LatticeEstimate) -> SensorDiagnos
     Residuals of all candidates come from one simulation with derivatives at the estimate; the parameters move along linearly. Those
     that explain less than a quarter, or what chance would (F-test), do not count; of others the fewest that leave hardly more than the
     best. A law that lacks something may look alike: nothing is corrected by them, but intervals reach to where they would move the
-    estimate.
+    estimate, and are as wide as beside them. In contact, where differences of simulations make up for anything, forces must be off by more
+    than their noise.
     """
-    if not estimate.noise_factor[1] ** 2 > MISFIT:
+    if problem.roughness > 0.0 and not estimate.noise_factor[1] ** 2 > MISFIT:
         return None
-    found = _at(problem, estimate)
-    before, count = _fitted(problem, found), int(np.isfinite(problem.load_cases[0].forces.force).sum())
+    found = at_estimate(problem, estimate)
+    before, count = fitted(problem, found), int(np.isfinite(problem.load_cases[0].forces.force).sum())
+    if not count:
+        return None
     fits = []
     for errors in CANDIDATES:
-        after = _fitted(replace(problem, sensor_errors=errors), found)
+        after = fitted(replace(problem, sensor_errors=errors), found)
         more, free = after.unknowns - before.unknowns, max(count - after.unknowns, 1)
         if more > 0 and errors.holds(problem.sensor_errors):
             ratio = (before.left - after.left) / more / (after.left / free)
@@ -108,17 +122,21 @@ def diagnosed(problem: StudyProblem, estimate: LatticeEstimate) -> SensorDiagnos
         return None
     least = min(after.left for _, after in fits)
     errors, after = next(fit for fit in fits if fit[1].left <= AS_WELL * least + NEGLIGIBLE * before.left)
+    variance = max(after.left / count, 1.0)
+    more_unsure = variance * (after.covariance - before.covariance)
+    if (after.step**2 + np.diag(more_unsure) < MOVES**2 * np.diag(estimate.covariance)).all():
+        return None
     theta = np.log(estimate.values)
     most = unsettled_covariance(theta, np.log(problem.unknowns.start), PRIOR_SD)
     most = np.maximum(most, np.diag(np.diag(estimate.covariance)))
-    moved = replace(estimate, covariance=about(estimate.covariance, after.step, most))
-    listed = _listed(replace(problem, sensor_errors=errors), found, after.covariance, max(after.left / count, 1.0), after.step)
+    moved = replace(estimate, covariance=about(estimate.covariance + more_unsure, after.step, most))
+    listed = _listed(replace(problem, sensor_errors=errors), found, after.covariance, variance, after.step)
     told = tuple(error for error in listed if abs(error.value) > TOLD * error.sd)
     return SensorDiagnosis(errors, told, (float(np.sqrt(before.left / count)), float(np.sqrt(after.left / count))), moved)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
+class LinearFit:
     """What forces lack after a step (p,) of all parameters, a sum of squares, with the covariance (p, p) and the number of unknowns."""
 
     left: float
@@ -127,12 +145,14 @@ class _Fit:
     unknowns: int
 
 
-def _at(problem: StudyProblem, estimate: LatticeEstimate) -> Reproduced:
+def at_estimate(problem: StudyProblem, estimate: LatticeEstimate) -> Reproduced:
+    """Return shapes and forces at an estimate, of fine steps, with derivatives."""
     unknowns = problem.unknowns
     return problem.load_cases[0].fine.run(unknowns.parameters(estimate.values), unknowns.changes(estimate.values))
 
 
-def _fitted(problem: StudyProblem, found: Reproduced) -> _Fit:
+def fitted(problem: StudyProblem, found: Reproduced) -> LinearFit:
+    """Return where derivatives say that the parameters fit best, errors of the sensors as the problem seeks them."""
     case = problem.load_cases[0]
     (points, of_points), (forces, of_forces) = problem.weighed(case, found, case.fine.long_step)
     factor = max(float(np.sqrt((points**2).mean())), 1.0) if len(points) else 1.0
@@ -141,7 +161,7 @@ def _fitted(problem: StudyProblem, found: Reproduced) -> _Fit:
     step = -covariance @ (of_points.T @ points / factor**2 + of_forces.T @ forces)
     bodies, errors = int(np.isfinite(case.forces.force).any(axis=(0, 2)).sum()), problem.sensor_errors
     unknowns = len(step) + bodies * (3 * errors.steady + int(errors.delay))
-    return _Fit(float(((forces + of_forces @ step) ** 2).sum()), step, covariance, unknowns)
+    return LinearFit(float(((forces + of_forces @ step) ** 2).sum()), step, covariance, unknowns)
 
 
 def _listed(
