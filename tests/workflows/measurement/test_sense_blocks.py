@@ -122,6 +122,15 @@ def test_nothing_is_resumed_where_there_is_nothing(pair: tuple[Path, Path], tmp_
         sense_blocks(*pair, out=tmp_path, plan=PLAN, resume=True)
 
 
+def test_what_is_refused_before_the_first_pass_leaves_nothing_to_resume(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    before = read_volume(pair[0])
+    flat = write_volume(tmp_path / "flat.zarr", before.with_values(np.full(before.shape, 7.0)))
+    for _ in range(2):
+        with pytest.raises(InputError, match="deformed"):
+            sense_blocks(pair[0], flat, out=tmp_path / "out", plan=PLAN)
+        assert not (tmp_path / "out" / CHECKPOINT).exists()
+
+
 def test_blocks_of_other_code_are_not_resumed(pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A version number does not change with every edit, and sums of two programs add up to nothing."""
 

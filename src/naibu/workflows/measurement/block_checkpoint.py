@@ -166,9 +166,9 @@ class BlockCheckpoint:
                     next(outcomes)
                 yield _loaded(path)
 
-    def forget(self) -> None:
-        """Remove the folder of a measurement that was refused before anything was computed: there is nothing to resume."""
-        if [path.name for path in self.folder.iterdir()] == [_HEAD]:
+    def forget(self, first: str) -> None:
+        """Remove the folder of a measurement that was refused before what is kept as `first` was computed: nothing is worth resuming."""
+        if not (self.folder / f"{first}.npz").is_file():
             self.remove()
 
     def remove(self) -> None:

@@ -184,7 +184,7 @@ def sense_blocks(
                 a, b, mask=opened["mask"], deformed_mask=opened["deformed_mask"], **used, runner=kept, progress=progress
             )
         except InputError:
-            kept.forget()
+            kept.forget("coarse")
             raise
         stores = _written(found, a, kept, folder)
     report_progress(progress, "page and figures")
