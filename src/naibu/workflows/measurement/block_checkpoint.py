@@ -165,6 +165,7 @@ class BlockCheckpoint:
                 if path not in there:
                     next(outcomes)
                 yield _loaded(path)
+            next(outcomes, None)  # they end by themselves, and the processes of the pool stay
 
     def forget(self, first: str) -> None:
         """Remove the folder of a measurement that was refused before what is kept as `first` was computed: nothing is worth resuming."""
