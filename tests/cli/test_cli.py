@@ -349,7 +349,7 @@ def test_the_reader_may_stop_it(naibu: Run, press: Press, monkeypatch: pytest.Mo
 
 def test_control_c_in_a_real_process(press: Press, tmp_path: Path) -> None:
     out = tmp_path / "here"
-    options = ["--known", KNOWN[0], "--element-size-mm", "10", "--out", str(out)]
+    options = ["--known", KNOWN[0], "--element-size-mm", "15", "--out", str(out)]
     command = [sys.executable, "-m", "naibu", "identify", str(press.folder), *options]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     try:

@@ -59,3 +59,9 @@ def own_process(seconds: float, progress: Progress | None) -> int:
     """Return the process's number after a while, in which another process takes the next task."""
     time.sleep(seconds)
     return os.getpid()
+
+
+def process_of_block(reference: object, deformed: object, mask: object, item: int) -> tuple[int, int]:
+    """Return the item, and the process's number after a while, in which another process takes the next block."""
+    time.sleep(1.0)
+    return item, os.getpid()

@@ -12,6 +12,7 @@ from scipy import ndimage
 from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
+from naibu.imaging.large_volumes import thinning
 from naibu.imaging.large_volumes.correlate_blocks import BlockwiseCorrelation, correlate_blocks
 from naibu.imaging.large_volumes.field_blocks import VoxelField, boxes_of
 from naibu.imaging.large_volumes.thinning import ThinnedValues, needed_memory_mb, thinned, thinning_factor
@@ -210,6 +211,20 @@ def test_coarse_voxels_are_smooth_values_in_their_places(factor: int) -> None:
     lazy = ThinnedValues(values, factor)
     assert lazy.shape == tuple(n)
     np.testing.assert_allclose(lazy[1:3, 0:2, 2:5], means[1:3, 0:2, 2:5], rtol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+def test_slabs_of_either_volume_make_up_the_coarse_one(factor: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = [ChunkedVolume.from_array(np.random.default_rng(k).integers(0, 1000, (23, 14, 11)), spacing_mm=(1.0, 0.5, 2.0)) for k in (1, 2)]
+    whole = [thinned(volume, factor) for volume in pair]
+    monkeypatch.setattr(thinning, "TILE", (7, 5))
+    slabs = thinning.slabs_of(pair[0].shape, factor)
+    assert len(slabs) > 2
+    for which in range(2):
+        parts = [thinning.thinned_slab_of_pair(pair[0], pair[1], None, factor, (which, slab)) for slab in slabs]
+        found = thinning.with_thinned_values(pair[which], factor, parts)
+        np.testing.assert_array_equal(found.values, whole[which].values)
+        assert found.same_grid(whole[which])
 
 
 def test_the_coarse_volume_has_no_more_voxels_than_allowed() -> None:

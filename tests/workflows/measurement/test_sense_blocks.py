@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from worker_tasks import process_of_block
 
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
@@ -17,10 +18,13 @@ from naibu.imaging.large_volumes.block_sums import compared_block
 from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.textured_sphere import squeezed_ball
 from naibu.workflows.measurement import block_checkpoint
+from naibu.workflows.measurement.block_checkpoint import BlockCheckpoint, StoredVolume
 from naibu.workflows.measurement.sense import sense
 from naibu.workflows.measurement.sense_blocks import CHECKPOINT, MemoryPlan, sense_blocks
 from naibu.workflows.parallel import local_worker
 from naibu.workflows.parallel.frames import write_frame
+from naibu.workflows.parallel.worker_count import Workers
+from naibu.workflows.parallel.worker_pool import WorkerPool
 
 pytest.importorskip("zarr")
 PLAN = MemoryPlan(1000.0, 500.0, 1, 24)
@@ -122,6 +126,27 @@ def test_too_little_memory_is_told_with_what_suffices(processes: int) -> None:
 def test_nothing_is_resumed_where_there_is_nothing(pair: tuple[Path, Path], tmp_path: Path) -> None:
     with pytest.raises(InputError, match="nothing to resume"):
         sense_blocks(*pair, out=tmp_path, plan=PLAN, resume=True)
+
+
+def test_processes_stay_from_one_pass_to_the_next(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    volumes = StoredVolume(str(pair[0])), StoredVolume(str(pair[1])), None
+    with WorkerPool() as pool:
+        kept = BlockCheckpoint(tmp_path / "kept", volumes, Workers(2), pool, 100.0, None)
+        kept.begin({}, {}, resume=False, overwrite=False)
+        first, second = (list(kept.each(name, process_of_block, (), range(4))) for name in ("first", "second"))
+        again = list(kept.each("second", process_of_block, (), range(4)))  # as after an interruption
+    assert [item for item, _ in first] == [item for item, _ in second] == [0, 1, 2, 3]
+    assert {pid for _, pid in first} == {pid for _, pid in second} and len({pid for _, pid in first}) == 2
+    assert again == second
+
+
+def test_what_is_refused_before_the_first_pass_leaves_nothing_to_resume(pair: tuple[Path, Path], tmp_path: Path) -> None:
+    before = read_volume(pair[0])
+    flat = write_volume(tmp_path / "flat.zarr", before.with_values(np.full(before.shape, 7.0)))
+    for _ in range(2):
+        with pytest.raises(InputError, match="deformed"):
+            sense_blocks(pair[0], flat, out=tmp_path / "out", plan=PLAN)
+        assert not (tmp_path / "out" / CHECKPOINT).exists()
 
 
 def test_blocks_of_other_code_are_not_resumed(pair: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,15 @@ from naibu.core.volume import Volume
 from naibu.imaging.large_volumes.block_frame import Block, BlockFrame, blocks_of
 from naibu.imaging.large_volumes.block_sums import ComparedBlock, Stage, compared_block
 from naibu.imaging.large_volumes.summed_equations import Model, SummedEquations
-from naibu.imaging.large_volumes.thinning import COARSE_VOXELS, SMOOTHING, thinned, thinning_factor
+from naibu.imaging.large_volumes.thinning import (
+    COARSE_VOXELS,
+    SMOOTHING,
+    slabs_of,
+    thinned,
+    thinned_slab_of_pair,
+    thinning_factor,
+    with_thinned_values,
+)
 from naibu.imaging.preprocessing.field_of_view import fields_of_view
 from naibu.imaging.preprocessing.volume_pair import require_known
 from naibu.imaging.volume_correlation.correlate import DEFAULT, Correlation
@@ -147,7 +155,7 @@ def correlate_blocks(
     run = runner or InProcess(reference, deformed, mask)
 
     def start() -> tuple[Correlation, int]:
-        return _coarsely((reference, deformed), (mask, deformed_mask), settings, factor, progress)
+        return _coarsely((reference, deformed), (mask, deformed_mask), settings, factor, run, progress)
 
     coarse, used = run.kept("coarse", start)
     equations = SummedEquations(coarse, reference, used)
@@ -195,19 +203,20 @@ def _coarsely(
     masks: tuple[ChunkedVolume | None, ChunkedVolume | None],
     settings: CorrelationSettings,
     factor: int | None,
+    run: Runner,
     progress: Progress | None,
 ) -> tuple[Correlation, int]:
     """Return the correlation of the coarse volumes, all but its covariance, and the factor by which they are coarser."""
     used = thinning_factor(volumes[0].shape) if factor is None else factor
     report_progress(progress, f"coarse volumes, every {used} voxels")
-    correlation = _correlation(volumes, masks, settings, used, progress)
+    correlation = _correlation(volumes, masks, settings, used, run, progress)
     if factor is None and used > 1:
         # the cells of the grid must not be larger than those in memory would be, where a larger coarse volume can be afforded
         affordable = thinning_factor(volumes[0].shape, 4 * COARSE_VOXELS)
         wanted = max(int(used * _voxels_in_cells(correlation)), affordable, 1)
         if wanted < used:
             used = wanted
-            correlation = _correlation(volumes, masks, settings, used, progress)
+            correlation = _correlation(volumes, masks, settings, used, run, progress)
     _require_cells(correlation, used)
     correlation.initialize()
     correlation.refine()
@@ -222,14 +231,24 @@ def _correlation(
     masks: tuple[ChunkedVolume | None, ChunkedVolume | None],
     settings: CorrelationSettings,
     factor: int,
+    run: Runner,
     progress: Progress | None,
 ) -> Correlation:
-    small = [thinned(v, factor) for v in volumes]
+    small = _thinned_pair(volumes, factor, run)
     for name, volume, view in zip(("reference", "deformed"), small, fields_of_view(small[0], small[1]), strict=True):
         require_known(volume, view, name, factor)
     shown: list[ArrayLike | None] = [None if m is None else thinned(m, factor, filled=True).values > TOUCHED for m in masks]
     kind = Correlation if factor == 1 else _ThinnedCorrelation
     return kind(small[0], small[1], (shown[0], shown[1]), settings, progress)
+
+
+def _thinned_pair(volumes: tuple[ChunkedVolume, ChunkedVolume], factor: int, run: Runner) -> tuple[Volume, Volume]:
+    slabs = slabs_of(volumes[0].shape, factor)
+    items = [(which, slab) for which in range(2) for slab in slabs]
+    name = f"every {factor} voxels"
+    parts = run.kept(f"{name}, volumes", lambda: list(run.each(name, thinned_slab_of_pair, (factor,), items)))
+    first, second = parts[: len(slabs)], parts[len(slabs) :]
+    return with_thinned_values(volumes[0], factor, first), with_thinned_values(volumes[1], factor, second)
 
 
 class _ThinnedCorrelation(Correlation):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,26 +45,48 @@ def thinned(volume: ChunkedVolume, factor: int, *, filled: bool = False) -> Volu
     filled : bool
         Whether the fractions of voxels that are not zero are wanted, as of masks.
     """
+    return with_thinned_values(
+        volume, factor, [thinned_slab(volume, factor, slab, filled=filled) for slab in slabs_of(volume.shape, factor)]
+    )
+
+
+def slabs_of(shape: tuple[int, ...], factor: int) -> list[tuple[int, int]]:
+    """Return the slabs, first plane and the one after the last, in which a volume of a shape is thinned out one after the other."""
+    planes, deep = -(-shape[0] // factor), max(1, TILE[0] // factor)
+    return [(z, min(z + deep, planes)) for z in range(0, planes, deep)]
+
+
+def thinned_slab(volume: ChunkedVolume, factor: int, slab: tuple[int, int], *, filled: bool = False) -> Float32Array:
+    """Return a slab of the voxels of `thinned`, of which only what it needs is read."""
     shape = tuple(-(-n // factor) for n in volume.shape)
-    out, reach = np.empty(shape, np.float32), _reach(factor)
-    deep, wide = (max(1, n // factor) for n in TILE)
-    for z in range(0, shape[0], deep):
-        for y in range(0, shape[1], wide):
-            ends = [(z, min(z + deep, shape[0])), (y, min(y + wide, shape[1])), (0, shape[2])]
-            read = [
-                (max(a * factor - reach, 0), min((b - 1) * factor + reach + 1, n)) for (a, b), n in zip(ends, volume.shape, strict=True)
-            ]
-            values = np.asarray(volume.values[tuple(slice(a, b) for a, b in read)])
-            part = (values != 0).astype(np.float32) if filled else values.astype(np.float32)
-            for axis, ((a, b), (first, _)) in enumerate(zip(ends, read, strict=True)):
-                part = _smoothed(part, np.arange(a, b) * factor - first, factor, axis)
-            out[z : ends[0][1], y : ends[1][1]] = part
+    out, reach, wide = np.empty((slab[1] - slab[0], *shape[1:]), np.float32), _reach(factor), max(1, TILE[1] // factor)
+    for y in range(0, shape[1], wide):
+        ends = [slab, (y, min(y + wide, shape[1])), (0, shape[2])]
+        read = [(max(a * factor - reach, 0), min((b - 1) * factor + reach + 1, n)) for (a, b), n in zip(ends, volume.shape, strict=True)]
+        values = np.asarray(volume.values[tuple(slice(a, b) for a, b in read)])
+        part = (values != 0).astype(np.float32) if filled else values.astype(np.float32)
+        for axis, ((a, b), (first, _)) in enumerate(zip(ends, read, strict=True)):
+            part = _smoothed(part, np.arange(a, b) * factor - first, factor, axis)
+        out[:, y : ends[1][1]] = part
+    return out
+
+
+def thinned_slab_of_pair(
+    reference: ChunkedVolume, deformed: ChunkedVolume, mask: ChunkedVolume | None, factor: int, which: tuple[int, tuple[int, int]]
+) -> Float32Array:
+    """Return a slab of the reference, ``(0, slab)``, or of the deformed volume, ``(1, slab)``, of `thinned`; it does not need the mask."""
+    return thinned_slab((reference, deformed)[which[0]], factor, which[1])
+
+
+def with_thinned_values(volume: ChunkedVolume, factor: int, slabs: Sequence[Float32Array]) -> Volume:
+    """Return the volume of `thinned` from all slabs."""
+    values = np.concatenate(slabs)
     return Volume.from_array(
-        out,
+        values,
         spacing_mm=volume.spacing_mm * factor,
         origin_mm=volume.origin_mm,
         direction=volume.direction,
-        missing=bool(np.isnan(out).any()),
+        missing=bool(np.isnan(values).any()),
     )
 
 

@@ -170,10 +170,11 @@ class BlockCheckpoint:
                 if path not in there:
                     next(outcomes)
                 yield _loaded(path)
+            next(outcomes, None)  # they end by themselves, and the processes of the pool stay
 
-    def forget(self) -> None:
-        """Remove the folder of a measurement that was refused before anything was computed: there is nothing to resume."""
-        if [path.name for path in self.folder.iterdir()] == [_HEAD]:
+    def forget(self, first: str) -> None:
+        """Remove the folder of a measurement that was refused before what is kept as `first` was computed: nothing is worth resuming."""
+        if not (self.folder / f"{first}.npz").is_file():
             self.remove()
 
     def remove(self) -> None:

@@ -190,7 +190,7 @@ def sense_blocks(
         try:
             found = correlate_blocks(a, scans[0], mask=opened["mask"], deformed_mask=scans[1], **used, runner=kept, progress=progress)
         except InputError:
-            kept.forget()
+            kept.forget("coarse")
             raise
         stores = _written(found, a, kept, folder)
     report_progress(progress, "page and figures")
