@@ -298,8 +298,8 @@ def _notes(cases: Sequence[CaseEvidence], noise_factor: float, deviations: dict[
         off = c.expected_mm is not None and abs(c.found_mm - c.expected_mm) > HEIGHT_NOISE * c.noise_mm
         if off and OFF_HEIGHT < c.height_change < FAR_HEIGHT:
             notes.append(
-                f"{c.name} is stated at {c.expected_mm:g} mm, but the markers put it at {c.found_mm:.1f} mm: check how it was measured, since "
-                "predictions at positions that were measured alike are off by as much."
+                f"{c.name} is stated at {c.expected_mm:g} mm, but the markers put it at {c.found_mm:.1f} mm: check how it was measured, "
+                "since predictions at positions that were measured alike are off by as much."
             )
         if len(c.residual) and c.noise_factor < NOISE_EXPLAINED and c.rms_mm > 0.9 * c.affine_mm:
             notes.append(
