@@ -12,11 +12,13 @@ Anderson's acceleration mixes :cite:p:`walker2011`.
 
 The tangent of a compressed body may be indefinite without the contact that held its surface. Where that contact slips or opens, and the
 body has moved on, such a tangent has no equilibrium nearby, and forces grow without bound. Springs as stiff as the elements then hold the
-nodes back, as in the method of Levenberg and Marquardt :cite:p:`nocedal2006`: the iterations of the whole body take up what they leave.
+nodes back, as in the method of Levenberg and Marquardt :cite:p:`nocedal2006`. From the balance with them, weaker ones go on, and at last
+none; where that does not succeed, the iterations of the whole body take up what the weakest have left.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
@@ -35,7 +37,10 @@ from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedI
 
 EVALUATIONS = 60  # of the contact at most
 CHANGES = 12  # matrices at most
-UNAIDED = 2  # of them before nodes are held back
+UNAIDED = 8  # of them before nodes are held back
+FAR = 3  # steps that are cut short, after which nodes are held back
+WEAKER = 8.0  # times which springs become weaker where a balance with them is found
+WEAKEST = 0.01  # of the stiffness of the elements: springs that are not made weaker still, but left out
 DEPTH = 6  # earlier steps with a matrix that are mixed
 TRIAL = 3  # steps with a matrix before it is judged: where a point closes, what is left grows before it vanishes
 SLOW = 0.7  # of what was left: mean progress of a step from which another matrix is worth while
@@ -84,20 +89,24 @@ class CondensedContact:
         Of the elements at the nodes, mN/mm.
     gripped : ndarray, shape (g,), int64
         Other nodes, which do not move.
+    balanced : bool
+        Whether the last forces that were sought are those of a balance, with springs or without.
     """
 
     tangent: EarlierTangent
     nodes: IntArray
     stiffness: FloatArray
     gripped: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    balanced: bool = field(init=False, default=True)
     _carried: NDArray[np.float32] = field(init=False)  # forces on gripped nodes (3 g, 3 k) from forces on the others, negative
     _holding: tuple[FloatArray, NDArray[np.int32]] = field(init=False)
     _inverse: NDArray[np.float32] = field(init=False)
     _changed: ChangedInverse | None = field(init=False, default=None)
-    _springs: FloatArray = field(init=False)  # that hold the nodes back (k,), mN/mm
+    _share: float = field(init=False, default=0.0)  # of the stiffness of the elements, with which springs hold the nodes back
+    _held_by: float = field(init=False, default=0.0)  # the share that `_changed` contains
 
     def __post_init__(self) -> None:
-        self._springs, free = np.zeros(len(self.nodes)), 3 * len(self.nodes)
+        free = 3 * len(self.nodes)
         whole = self.tangent.factors.between(np.concatenate([self.nodes, self.gripped]))
         self._inverse, self._carried = whole, np.zeros((0, free), dtype=np.float32)
         if len(self.gripped):
@@ -131,6 +140,8 @@ class CondensedContact:
         faint_mn: float,
         most: int = CHANGES,
         unaided: int = UNAIDED,
+        within: float = BALANCED,
+        until: float = np.inf,
     ) -> Generator[None, None, FloatArray]:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.
 
@@ -154,28 +165,77 @@ class CondensedContact:
             Matrices at most.
         unaided : int
             Of them before nodes are held back.
+        within : float
+            Fraction of the forces by which they may differ from those of the motion that they lead to.
+        until : float
+            Time of the thread, s, from which no further matrix is made.
         """
-        at = best = begun = self._tried(begin, begin, free, law)
-        evaluations, changes, steps, mixing = 1, 0, 0, AndersonMixing(DEPTH)
-        useless = self._changed is None
+        search = _Search(self, free, law, tolerance_mm * within / BALANCED, longest_mm, faint_mn, within, until)
+        anchor, kept = begin, None
+        while True:
+            aided = self._share > 0.0 or most == unaided
+            found, balanced = yield from search.near(anchor, most if aided else unaided, EVALUATIONS if aided else FAR)
+            self.balanced = balanced or kept is not None
+            if balanced and self._share == 0.0:
+                return found.force
+            if balanced:  # the springs go on from where the nodes are, and weaker: at last they take nothing
+                anchor, kept = found.motion, found
+                self._share = self._share / WEAKER if self._share > WEAKEST else 0.0
+            elif kept is not None:
+                self._share = WEAKER * max(self._share, WEAKEST / WEAKER)
+                return kept.force
+            elif self._share == 1.0 or most == unaided or len(law.opened().nodes) == 0:
+                return found.force
+            else:
+                self._share = 1.0
+
+
+@dataclass(slots=True, eq=False)
+class _Search:
+    """A search for the motion ``y = free + W g(y)``; see `CondensedContact.forces` for the attributes."""
+
+    body: CondensedContact
+    free: FloatArray
+    law: ContactLaw
+    tolerance_mm: float
+    longest_mm: float
+    faint_mn: float
+    within: float
+    until: float
+    _begin: FloatArray = field(init=False)
+    _springs: FloatArray = field(init=False)  # that hold the nodes back (k,), mN/mm
+
+    def near(self, begin: FloatArray, most: int, far: int) -> Generator[None, None, tuple[_Motion, bool]]:
+        """Return the best that is found from a motion (k, 3), mm, with springs that end there, and whether it is a balance with them.
+
+        It takes at most so many matrices, and none once more than `far` steps have been longer than they may.
+        """
+        body, law, self._begin = self.body, self.law, begin
+        self._springs = np.zeros(len(begin))
+        if body._share:
+            held = law.opened().nodes
+            self._springs[held] = body._share * body.stiffness[held]
+        if body._held_by != body._share:
+            body._changed, body._held_by = None, body._share
+        at = best = begun = self._tried(begin)
+        evaluations, changes, steps, cut_short, mixing = 1, 0, 0, 0, AndersonMixing(DEPTH)
+        useless = body._changed is None
         while evaluations < EVALUATIONS:
-            if at.size <= tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, begin, law, BALANCED, faint_mn):
-                return at.force
-            if self._changed is None or useless:
-                if self._consistent(at, begin, law, ENOUGH, faint_mn):
-                    return at.force
-                if changes == most:
+            if at.size <= self.tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, self.within):
+                return at, True
+            if body._changed is None or useless:
+                if self._consistent(at, max(ENOUGH, self.within)):
+                    return at, True
+                if changes == most or cut_short > far or (changes and time.thread_time() > self.until):
                     break
                 yield
-                if changes == unaided and not self._springs.any() and len(held := law.opened().nodes):
-                    self._springs[held] = self.stiffness[held]
-                    at = best = self._tried(begin, begin, free, law)
                 change = law.change().with_springs(self._springs)
-                self._changed, changes = ChangedInverse.of(self._inverse, change), changes + 1
+                body._changed, changes = ChangedInverse.of(body._inverse, change), changes + 1
                 begun, steps, mixing = at, 0, AndersonMixing(DEPTH)
-            step = mixing.step(at.motion.ravel(), -self._changed.solve(at.left).ravel()).reshape(-1, 3)
-            share = min(1.0, longest_mm / float(np.abs(step).max()))
-            before, at = at, self._tried(at.motion + share * step, begin, free, law)
+            step = mixing.step(at.motion.ravel(), -body._changed.solve(at.left).ravel()).reshape(-1, 3)
+            share = min(1.0, self.longest_mm / float(np.abs(step).max()))
+            cut_short += share < 1.0
+            before, at = at, self._tried(at.motion + share * step)
             evaluations, steps = evaluations + 1, steps + 1
             if mixing.steps > 1 and at.size > JUMP * before.size:
                 at, mixing = before, AndersonMixing(DEPTH)
@@ -184,22 +244,22 @@ class CondensedContact:
             useless = slow or share < 1.0 or at.size > JUMP * begun.size
             if at.size < best.size:
                 best = at
-        return best.force
+        return best, False
 
-    def _tried(self, motion: FloatArray, begin: FloatArray, free: FloatArray, law: ContactLaw) -> _Motion:
-        force = self._forces(motion, begin, law)
-        left = motion - free - (self._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
+    def _tried(self, motion: FloatArray) -> _Motion:
+        force = self._forces(motion)
+        left = motion - self.free - (self.body._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
         return _Motion(motion, force, left, float(np.abs(left).max(initial=0.0)))
 
-    def _forces(self, motion: FloatArray, begin: FloatArray, law: ContactLaw) -> FloatArray:
+    def _forces(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3) of contacts, and of the springs that hold the nodes back, mN."""
-        return np.asarray(law(motion) - self._springs[:, None] * (motion - begin))
+        return np.asarray(self.law(motion) - self._springs[:, None] * (motion - self._begin))
 
-    def _consistent(self, at: _Motion, begin: FloatArray, law: ContactLaw, fraction: float, faint_mn: float) -> bool:
+    def _consistent(self, at: _Motion, fraction: float) -> bool:
         """Whether the forces of a motion are, but for little, those of the motion that they lead to; the law is left where it was."""
-        apart = float(np.abs(self._forces(at.motion - at.left, begin, law) - at.force).sum())
-        law(at.motion)
-        return apart <= fraction * (min(float(np.abs(at.force).sum()), law.exerted) + faint_mn)
+        apart = float(np.abs(self._forces(at.motion - at.left) - at.force).sum())
+        self.law(at.motion)
+        return apart <= fraction * (min(float(np.abs(at.force).sum()), self.law.exerted) + self.faint_mn)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -67,7 +67,7 @@ def _mean_edges(points: FloatArray, faces: IntArray) -> FloatArray:
 
 def tangent_at(
     engine: RealTimeModel, u: FloatArray, contacts: Contacts, held: IntArray, ahead: IntArray, slipped: FloatArray | None,
-    begun: LipMultipliers | None,
+    begun: LipMultipliers | None, duration: float = 0.0,
 ) -> EarlierTangent:  # fmt: skip
     """Return the tangent at a displacement, and columns of its inverse for the nodes that come into contact.
 
@@ -95,7 +95,7 @@ def tangent_at(
     for some, place, all_places in zip(*contacts, strict=False):
         some.add_symmetric_stiffness(pattern, all_places, blocks)
         some.add_symmetric_stiffness(engine._surface, place, contact)
-    blocks[pattern.diagonal()] += (engine.mass / engine.step**2)[:, None, None] * np.eye(3)
+    blocks[pattern.diagonal()] += (engine.mass / (duration or engine.step) ** 2)[:, None, None] * np.eye(3)
     fixed = np.zeros(engine.points.shape, dtype=bool)
     fixed[held] = True
     solver = engine._solvers.get()

@@ -45,6 +45,7 @@ class TangentSession(DynamicSession):
     _age: int = field(init=False, default=0)
     _slipped: FloatArray | None = field(init=False, default=None)  # anchors of the sides of cuts when the last step began
     _begun: LipMultipliers | None = field(init=False, default=None)  # and what they exerted
+    _duration: float = field(init=False, default=0.0)  # of the step, or part, whose balance is sought, s; 0: a step
     _until: float = field(init=False, default=np.inf)  # processor time at which a step is left to the next call
 
     def keep_tangent(self) -> None:
@@ -118,24 +119,24 @@ class TangentSession(DynamicSession):
 
     def _renewed(self) -> Generator[None, None, EarlierTangent]:
         """Return the tangent of the state reached, which the step waits for; the thread makes it where there is no time."""
-        u = self.reached.displacement
+        u, whole = self.reached.displacement, self._duration == self.engine.step
         gaps = []
         for near, contact in zip(self._near, self._templates, strict=True):
             near.add_force(u, np.zeros_like(u))
             gaps.append(np.full(len(contact.nodes), np.inf))
             gaps[-1][near.points] = near.gap
         ahead = self._soon_touched(self._templates, gaps)
-        make = partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped, self._begun)
+        make = partial(self._made, u, self._near, self._places, self._held(), ahead, self._slipped, self._begun, self._duration)
         if not self._engine.background or self._until == np.inf:
-            return self._used(self._keep(make()))
+            return self._used(self._keep(make()) if whole else make())
         while not self._thread.idle:
-            if (done := self._thread.take()) is not None:
-                self._keep(done)
+            if (done := self._thread.take()) is not None and self._keep(done).displacement is u and whole:
+                return self._used(done)  # which was begun when the last step ended
             yield from self._pause()
         self._thread.submit(make)
         while (done := self._thread.take()) is None:
             yield from self._pause()
-        return self._used(self._keep(done))
+        return self._used(self._keep(done) if whole else done)
 
     def _pause(self) -> Iterator[None]:
         """Wait a moment, and end the frame if it has an end."""
@@ -168,13 +169,14 @@ class TangentSession(DynamicSession):
         ahead: IntArray,
         slipped: FloatArray | None,
         begun: LipMultipliers | None,
+        duration: float = 0.0,
     ) -> EarlierTangent:
         """Return the tangent at a displacement with contacts, and columns of its inverse for nodes `ahead`.
 
         Of sides of cuts that slide, its secant is that of a step that began with these anchors: at the end of a step they have slipped.
         Those that press do so as in this step.
         """
-        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead, slipped, begun)
+        return tangent_at(self._engine, u, (near, places, self._positions), held, ahead, slipped, begun, duration)
 
     def _release(self, tangent: EarlierTangent | None) -> None:
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""

@@ -1,0 +1,95 @@
+"""Steps that are taken in parts where their balance is not found: as Newton's method takes that many shorter ones."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from naibu.core.arrays import FloatArray
+from naibu.mechanics import (
+    Assembler,
+    DynamicEngine,
+    IndenterVelocity,
+    RealTimeEngine,
+    body_force,
+    elements,
+    material,
+    spherical_indenter,
+)
+from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.finite_strain.sessions.divided_session import PARTS
+from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
+from naibu.mechanics.finite_strain.sessions.trial_displacement import Trial
+from naibu.meshing import boundary_faces, box
+
+SIZE = 40.0
+DOWN = [IndenterVelocity((0.0, 0.0, -30.0))]
+
+
+def engine(kind: type[DynamicEngine], **options: bool) -> DynamicEngine:
+    mesh = box((SIZE,) * 3, (3, 3, 3))
+    discrete = elements(mesh, "mean_dilatation")
+    assembler = Assembler.from_materials(discrete, mesh.regions, [material(young_modulus=70.0, poisson_ratio=0.499)])
+    mass = body_force(discrete, np.full(mesh.n_cells, 1e-6), np.array([1.0, 0.0, 0.0]))[:, 0]
+    return kind(mesh.points, assembler, mass, boundary_faces(mesh).faces, normal_stiffness=2e3, **options)
+
+
+def held(points: FloatArray) -> list[np.ndarray]:
+    return [np.flatnonzero(points[:, 2] < 1e-9)]
+
+
+def without_long_steps(monkeypatch: pytest.MonkeyPatch, longest_s: float) -> None:
+    """No balance is found in real time for steps above a length."""
+    found = RealTimeSession._quasi_newton
+
+    def some(self: RealTimeSession, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, Trial | None]:
+        return (yield from found(self, moving, contacts)) if self._duration <= longest_s else None
+
+    monkeypatch.setattr(RealTimeSession, "_quasi_newton", some)
+
+
+@pytest.mark.parametrize("parts", PARTS)
+def test_parts_are_the_shorter_steps_of_newtons_method(monkeypatch: pytest.MonkeyPatch, parts: int) -> None:
+    made, whole = engine(RealTimeEngine, background=False), engine(DynamicEngine)
+    without_long_steps(monkeypatch, 1.01 * made.step / parts)
+    sphere = spherical_indenter((1.0, 2.0, SIZE + 8.2), 8.0, static_friction=0.3, kinetic_friction=0.3)
+    shorter = replace(whole, step=whole.step / parts, tolerance=1e-5)
+    both = [e.session(constrained=held(made.points), indenters=[sphere]) for e in (made, shorter)]
+    with both[0] as session, both[1] as newton:
+        for _ in range(8):
+            forces = session.step(motions=DOWN)
+            expected = newton.step(motions=DOWN, steps=parts)
+            moved, fast = np.abs(newton.positions() - made.points).max(), np.abs(newton.state().velocity).max()
+            np.testing.assert_allclose(session.positions(), newton.positions(), atol=0.01 * moved)
+            np.testing.assert_allclose(session.state().velocity, newton.state().velocity, atol=0.04 * fast)
+            assert forces.indenters[0, 0, 2] == pytest.approx(expected.indenters[:, 0, 2].mean(), rel=0.02)
+            assert forces.bodies[0, 0, 2] == pytest.approx(expected.bodies[:, 0, 2].mean(), rel=0.02, abs=1.0)
+    assert moved > 1.0
+    assert isinstance(session, RealTimeSession)
+    assert session.divided_steps == 8 and session.newton_steps == 0
+
+
+def test_parts_that_are_taken_in_many_calls_are_the_same_and_can_be_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = engine(RealTimeEngine, background=False)
+    without_long_steps(monkeypatch, 0.5 * made.step)
+    ends = []
+    for budget in (np.inf, 0.0):
+        sphere = spherical_indenter((1.0, 2.0, SIZE + 8.2), 8.0)
+        with made.session(constrained=held(made.points), indenters=[sphere]) as session:
+            assert isinstance(session, RealTimeSession)
+            for _ in range(4):
+                before = session.positions()
+                while session.step_within(budget, motions=DOWN) is None:
+                    np.testing.assert_array_equal(session.positions(), before)
+            ends.append(session.positions())
+            if budget == 0.0:
+                for _ in range(12):  # some parts are behind it
+                    assert session.step_within(0.0, motions=DOWN) is None
+                session.constrain(held(made.points))
+                assert not session.under_way
+                np.testing.assert_array_equal(session.positions(), ends[-1])
+                session.step(motions=[IndenterVelocity((0.0, 0.0, 60.0))])  # contact is found anew
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12, atol=1e-12)
