@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import ConvergenceError
+from naibu.identification.from_fields import estimate
 from naibu.identification.from_fields.forward.field_laws import LawName, field_law
 from naibu.identification.from_fields.forward.forward_model import Solvers, equilibrium
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
@@ -200,6 +202,29 @@ def test_poisson_ratio_goes_no_higher_while_regions_are_sought_if_the_surface_is
     between_plates = cube(LAYERS)
     held = FieldModel(between_plates.mesh, between_plates.load_cases(sd_mm=0.1), between_plates.zones(), elements="as_given")
     assert no_less_compressible(held, theta, stated) == stated
+
+
+def test_regions_without_equilibrium_as_whole_cells_keep_borders_on_faces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Borders within cells are found with mixed cells; whole ones of these moduli may be inverted, which ended a map with an error."""
+    fields, zones = model(7)
+    graph, found = ZoneGraph.of(fields.mesh, fields.zones), _homogeneous(fields)
+    of_zone = np.zeros(graph.count, dtype=np.int64)
+    of_zone[fields.zones.of_cell[zones.of_cell == 1]] = 1
+    regions = Segmentation(of_zone, zones, replace(found, misfit=2.0 * found.misfit), 20, 0)
+    refined = replace(refined_borders_at(fields, Borders.of(fields.mesh, zones)), zones=zones, point=found)
+
+    def inverted(*_: object) -> Point:
+        raise ConvergenceError("a cell is inverted")
+
+    monkeypatch.setattr(estimate, "refined_regions", lambda *_: refined)
+    monkeypatch.setattr(estimate, "point_at", inverted)
+    monkeypatch.setattr(estimate._Recipe, "_fitted", lambda *_: found)
+    monkeypatch.setattr(estimate._Recipe, "_sharp", lambda _, *kept: kept)
+    cases = (fields.observed[0].load_case,)
+    recipe = estimate._Recipe(fields, cases, "linear", "as_given", Bounds(), [], None, None, (), None)
+    kept: object = recipe._with_borders(regions, graph)
+    assert kept == (zones, found, None)
+    assert recipe.steps[-1].endswith("borders on faces of cells are kept")
 
 
 def _two_lumps(*radii_mm: float) -> tuple[FieldModel, np.ndarray]:

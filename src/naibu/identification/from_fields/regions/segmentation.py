@@ -349,7 +349,7 @@ def _with_less(
     below, apart = criterion.value(labels, point), np.zeros(area.shape, dtype=bool)
     for most in _numbers_of_mergers(len(area)):
         united, theta = merged(scaled, point.theta, area, criterion.weight, criterion.charge, most, apart)
-        gather: FloatArray = np.kron(np.eye(2), np.eye(int(united.max()) + 1)[united]).astype(np.float64)
+        gather = np.asarray(np.kron(np.eye(2), np.eye(int(united.max()) + 1)[united]), dtype=float)
         start = _Start(theta, point, _gathered(quadratic, gather), float(np.abs(gather @ theta - point.theta).max()) > FAR)
         new, found = _refitted(model, criterion, united[labels], start, bounds, progress)
         if int(united.max()) + 1 == len(area) or criterion.value(new, found.point) < below:
