@@ -167,6 +167,13 @@ def steadily_pushed(study: LatticeStudy) -> StudyProblem:
     return StudyProblem.of(StudyUnknowns.of(study, groups="given", friction="each"), [], recorded, point_sd_mm=0.5)
 
 
+def test_without_regressions_intervals_in_contact_are_those_of_the_prior(pushed: LatticeStudy) -> None:
+    made = steadily_pushed(pushed)
+    found = calibrate_lattice(made, made.unknowns.start, widen=False, threads=1)
+    assert found.finished and not found.settled and "weak prior" in found.remarks[0]
+    assert (np.diag(found.covariance) >= PRIOR_SD**2).all()
+
+
 def test_friction_of_a_pushed_block_is_force_over_weight(pushed: LatticeStudy) -> None:
     problem = steadily_pushed(pushed)
     found = calibrate_lattice(problem, problem.unknowns.start)

@@ -23,6 +23,7 @@ IMPROVED = (
     "Intervals rest on derivatives that steps of the search improved, a few percent off, and are not widened to where chi-squared itself "
     "rises."
 )
+NOT_TOLD = "Nothing told how exact the values are: intervals hold what the weak prior holds."
 CUT_SHORT = "The search was interrupted before anything told how exact its values are: intervals hold what the weak prior holds."
 
 
@@ -102,15 +103,21 @@ def estimate_from(
     )  # fmt: skip
 
 
+def without_intervals(
+    problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations
+) -> LatticeEstimate:
+    """Return a point at which a search stopped before anything told how exact it is: intervals hold what the weak prior holds."""
+    covariance = unsettled_covariance(point.theta, centre, prior_sd)
+    found = estimate_from(problem, point, covariance, at.count, at.runs, finished=False)
+    nothing = np.zeros_like(covariance)
+    return replace(found, information=nothing, undetermined=identifiability(problem.unknowns.names, nothing), settled=False)
+
+
 def interrupted_estimate(
     problem: InverseProblem, point: EvaluatedPoint, centre: FloatArray, prior_sd: float, at: Evaluations
 ) -> LatticeEstimate:
     """Return the best so far; its derivatives may be those of steps, and in contact they count jumps as information."""
     if problem.shifts(np.exp(point.theta)) is not None:
-        covariance = unsettled_covariance(point.theta, centre, prior_sd)
-        found = estimate_from(problem, point, covariance, at.count, at.runs, finished=False)
-        nothing = np.zeros_like(covariance)
-        said = identifiability(problem.unknowns.names, nothing)
-        return replace(found, information=nothing, undetermined=said, settled=False, remarks=(CUT_SHORT,))
+        return replace(without_intervals(problem, point, centre, prior_sd, at), remarks=(CUT_SHORT,))
     covariance = covariance_before_the_minimum(point, centre, prior_sd)
     return replace(estimate_from(problem, point, covariance, at.count, at.runs, finished=False), remarks=(IMPROVED,))

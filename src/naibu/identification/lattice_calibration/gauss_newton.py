@@ -19,7 +19,14 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import Progress
 from naibu.identification.lattice_calibration.captured.shape_distance import closest_points
-from naibu.identification.lattice_calibration.estimate import IMPROVED, LatticeEstimate, estimate_from, interrupted_estimate
+from naibu.identification.lattice_calibration.estimate import (
+    IMPROVED,
+    NOT_TOLD,
+    LatticeEstimate,
+    estimate_from,
+    interrupted_estimate,
+    without_intervals,
+)
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint, Residual, evaluated
 from naibu.identification.lattice_calibration.forward_model import SAMPLE_S, Capture, PushedLattice, PushMode, Reproduced, averaged
 from naibu.identification.lattice_calibration.intervals.local_regression import LocalRegression
@@ -224,8 +231,9 @@ def calibrate_lattice(
         Values from which the search begins, as the estimate of a similar problem; weak priors stay around `start`. By default `start`.
     widen : bool
         Whether the covariance is widened to where chi-squared itself rises, all others fitted again, which takes derivatives once
-        more and, of nine parameters, some forty simulations of each load case; not of differences of simulations, as in contact.
-        Otherwise derivatives are those that steps of the search improved, and `LatticeEstimate.remarks` says so.
+        more and, of nine parameters, some forty simulations of each load case. Otherwise derivatives are those that steps of the search
+        improved, and `LatticeEstimate.remarks` says so. In contact, whether regressions around the end follow; otherwise intervals are
+        as wide as the weak prior.
     threads : int
         Into how many parts the derivatives of every capture are shared; by default as many threads compute them.
     executor : concurrent.futures.Executor
@@ -249,7 +257,7 @@ def calibrate_lattice(
     at = Evaluations(threads, executor, progress)
     try:
         if problem.shifts(np.exp(centre)) is not None:
-            return _searched_in_contact(problem, centre, first, prior_sd, max_iterations, at)
+            return _searched_in_contact(problem, centre, first, prior_sd, max_iterations, at, widen=widen)
         return _searched(problem, centre, first, prior_sd, max_iterations, reweigh, widen, at)
     except KeyboardInterrupt:
         if at.best is None or at.problem is None:
@@ -291,11 +299,14 @@ def _in_other_units(point: EvaluatedPoint, old: tuple[float, float], new: tuple[
 
 
 def _searched_in_contact(
-    problem: InverseProblem, centre: FloatArray, first: FloatArray, prior_sd: float, most: int, at: Evaluations
+    problem: InverseProblem, centre: FloatArray, first: FloatArray, prior_sd: float, most: int, at: Evaluations, *, widen: bool = True
 ) -> LatticeEstimate:
     points = SimulatedPoints(problem, at)
     search = SecantSearch(points, centre, prior_sd, first)
     search.run(most)
+    if not widen:
+        found = without_intervals(problem, search.point, centre, prior_sd, at)
+        return replace(found, iterations=search.iterations, finished=True, remarks=(NOT_TOLD,))
     local = LocalRegression(points, search.theta, search.residual, centre, prior_sd, search.covariance())
     point, covariance = local.run()
     information = np.linalg.inv(covariance) - np.eye(len(centre)) / prior_sd**2
