@@ -140,7 +140,6 @@ class CondensedContact:
         faint_mn: float,
         most: int = CHANGES,
         unaided: int = UNAIDED,
-        within: float = BALANCED,
         until: float = np.inf,
     ) -> Generator[None, None, FloatArray]:
         """Return the forces g (k, 3), mN, under which ``y = free + W g(y)``; the best that is found in a few iterations.
@@ -165,12 +164,10 @@ class CondensedContact:
             Matrices at most.
         unaided : int
             Of them before nodes are held back.
-        within : float
-            Fraction of the forces by which they may differ from those of the motion that they lead to.
         until : float
             Time of the thread, s, from which no further matrix is made.
         """
-        search = _Search(self, free, law, tolerance_mm * within / BALANCED, longest_mm, faint_mn, within, until)
+        search = _Search(self, free, law, tolerance_mm, longest_mm, faint_mn, until)
         anchor, kept = begin, None
         while True:
             aided = self._share > 0.0 or most == unaided
@@ -200,7 +197,6 @@ class _Search:
     tolerance_mm: float
     longest_mm: float
     faint_mn: float
-    within: float
     until: float
     _begin: FloatArray = field(init=False)
     _springs: FloatArray = field(init=False)  # that hold the nodes back (k,), mN/mm
@@ -221,10 +217,10 @@ class _Search:
         evaluations, changes, steps, cut_short, mixing = 1, 0, 0, 0, AndersonMixing(DEPTH)
         useless = body._changed is None
         while evaluations < EVALUATIONS:
-            if at.size <= self.tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, self.within):
+            if at.size <= self.tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, BALANCED):
                 return at, True
             if body._changed is None or useless:
-                if self._consistent(at, max(ENOUGH, self.within)):
+                if self._consistent(at, ENOUGH):
                     return at, True
                 if changes == most or cut_short > far or (changes and time.thread_time() > self.until):
                     break

@@ -23,7 +23,7 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
-from naibu.mechanics.finite_strain.sessions.condensed_contact import BALANCED, CHANGES, UNAIDED, CondensedContact, ContactBesideTangent
+from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, UNAIDED, CondensedContact, ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.divided_session import DividedSession
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
@@ -40,7 +40,6 @@ ACCEPTED = 0.06  # of a step that has used up its iterations; where it was 0.2, 
 BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is taken; one that is worse goes on, and real time is lost
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
 FURTHER, NEARER = 5, 0.7  # more of them, where the others reduced the error to so much of what it was before
-LOOSE, LOOSEST = 0.5, 0.1  # times the error: how far contacts may be from balance in the next iteration, which moves on; and at most
 HOPE = 3  # iterations, behind which others are given up where the error is still above UNLIKELY
 STALLED = 0.02  # of the contact forces: what iterations that reduce the error no longer may leave where sides of cuts rub
 FEW = 200  # nodes of contact at most with which they cost less than a tangent of the step's own
@@ -355,11 +354,9 @@ class RealTimeSession(DividedSession):
                 begin[carried] = self.reached.displacement[carried] + way - trial.displacement[carried]
             extent, faint = self.engine._extent, self._engine.faint_mn
             longest = min(0.05 * extent, float(harmless_ways(self.indenters).min(initial=np.inf)))
-            rubs = self.engine.assembler.unsymmetric
-            limits = (RUBBING, RUBBING) if rubs else (CHANGES, UNAIDED)
-            within = BALANCED if rubs else min(max(BALANCED, LOOSE * trial.error), LOOSEST)
+            limits = (RUBBING, RUBBING) if self.engine.assembler.unsymmetric else (CHANGES, UNAIDED)
             alone = condensed.held(free[nodes], free[gripped])
-            force = yield from condensed.forces(alone, law, begin[nodes], 1e-5 * extent, longest, faint, *limits, within, self._patience)
+            force = yield from condensed.forces(alone, law, begin[nodes], 1e-5 * extent, longest, faint, *limits, self._patience)
             holding = condensed.holding(free[gripped], force)
             tangent.factors.add_columns(np.concatenate([nodes, gripped]), np.concatenate([force, holding]), x)
         free[self._constrained] = 0.0
