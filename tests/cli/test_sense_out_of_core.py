@@ -76,11 +76,13 @@ def test_bad_scans_are_refused_and_leave_nothing_to_resume(
     }  # fmt: skip
     for name, values in volumes.items():
         write_volume(Path(f"{name}.zarr"), Volume.from_array(values, spacing_mm=(1.0, 1.0, 1.0), missing=True))
+    write_volume(Path("wider.zarr"), Volume.from_array(scan, spacing_mm=(1.0, 1.0, 1.2)))
     for words, expected in (
         ("constant scan", ("reference", "constant", "7")),
         ("scan unknown", ("deformed", "every voxel is NaN")),
         ("holed moved", ("a voxel near", "reference", "NaN")),
-        ("scan lower", ("deformed", "different grids", "70")),
+        ("scan lower", ("no common content", "lies on another grid", "70")),
+        ("scan wider", ("deformed", "as many voxels", "wrong spacing")),
         ("slice slice", ("74 x 72 x 1 voxels", "lucas-kanade")),
         ("scan moved --mask zero", ("--mask", "empty")),
         ("scan moved --mask small", ("mask spans [37, 36, 3] voxels",)),

@@ -189,9 +189,11 @@ def sense_blocks(
             kept, scans = _on_reference_grid(kept, a, *scans)
         try:
             found = correlate_blocks(a, scans[0], mask=opened["mask"], deformed_mask=scans[1], **used, runner=kept, progress=progress)
-        except InputError:
+        except InputError as error:
             kept.forget("coarse")
-            raise
+            if not told:
+                raise
+            raise InputError(f"{error}. {told}") from error
         stores = _written(found, a, kept, folder)
     report_progress(progress, "page and figures")
     inputs = input_record({role: path for role, path in paths.items() if path is not None})
