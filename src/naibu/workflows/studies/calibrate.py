@@ -168,11 +168,7 @@ def calibrate_study(
         "starts": starts, "sensor_errors": sensor_errors,
         **{f"SHA-256 of {file}": digest for file, digest in {**prepared.inputs, **_hashes((*shapes, *forces))}.items()},
     }  # fmt: skip
-    warnings = (
-        *_warnings_of_starts(several),
-        *told,
-        *_warnings(problem, estimate, before),
-    )
+    warnings = (*_warnings_of_starts(several), *told, *_warnings(problem, estimate, before))
     chapter = calibration_chapter(prepared.title, problem, estimate, before, after, records, warnings, options, several, sensors)
     comment = f"{prepared.title}, calibrated by naibu {__version__} from {', '.join(map(_file_name, (*shapes, *forces)))}"
     target = write_atomically(folder / name, study_document(_with_volumes(prepared, settings, folder), comment))
