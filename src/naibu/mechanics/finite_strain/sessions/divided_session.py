@@ -1,8 +1,8 @@
 """Sessions in real time that take a step in parts where its balance is not found, and leave one that takes long to the next call.
 
 The balance of a part is easier to find: the motion is less, and the inertia of a shorter time holds the body more firmly. Where a body is
-let go, or falls on its support, eight parts with one tangent of theirs, each of one or two iterations, take a tenth of the time of Newton's
-method for the whole step, which follows the motion little by little.
+let go, or falls on its support, some parts with one tangent of theirs, each of few iterations, take less time than Newton's method for the
+whole step, which follows the motion little by little.
 """
 
 from __future__ import annotations
