@@ -28,7 +28,7 @@ SHIFTS = 1.22074408460575947536 ** -np.arange(1.0, 4.0)
 SPREAD = 0.7  # cells: SD of the window in which cells share what is hidden
 REACH = 1.2 * RADIUS  # cells: within which the displacement is lost
 MOST_EVIDENCE = 15.0  # logarithm of how much more probable a part at one place is than at another, beyond which it does not matter
-RESPONSE_TOLERANCE = 0.01  # of the linear solves: conjugate gradients find the smooth part, in which the parts of a lattice differ, last
+LOSS_TOLERANCE = 0.01  # of the linear solves: conjugate gradients find the smooth part, in which the parts of a lattice differ, last
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,14 +150,15 @@ def hidden_dilatation(
     Notes
     -----
     With the matrix A of the equations, of which D is that of the intensities, a part of displacement t leaves of itself A^-1 D t. What is
-    lost, ``h = t - A^-1 D t``, makes the intensities pull by t.D h, the information on its dilatation where the penalties state what
-    else may be there. Noise may be larger than the weights of the voxels say: residuals of neighbours are correlated.
+    lost, ``h = t - A^-1 D t = A^-1 (A - D) t``, makes the intensities pull by t.D h, the information on its dilatation where the penalties
+    state what else may be there. Noise may be larger than the weights of the voxels say: residuals of neighbours are correlated.
     """
     system = fit.system
     if not some.any():
         return np.zeros(len(some)), np.zeros(len(some))
-    response = system.solved_many(np.ascontiguousarray(loads, dtype=np.float32), RESPONSE_TOLERANCE)[0]
-    lost, deformation = trial.coefficients - response, deformation_at_middles(fit, c)
+    # A^-1 (A - D) t and not t - A^-1 D t, of which errors of the solution would be a large part where the data decide
+    taken = system.multiplied(system.matrix, trial.coefficients) - loads
+    lost, deformation = system.solved_many(np.ascontiguousarray(taken, dtype=np.float32), LOSS_TOLERANCE)[0], deformation_at_middles(fit, c)
     informed = (np.asarray(loads, dtype=float) * lost).sum(axis=1)
     by_noise = np.einsum("nik,nis->ks", lost, system.multiplied(system.matrix, noise), dtype=float)
     louder = max(1.0, float(((by_noise**2).mean(axis=1) / np.maximum(informed.sum(axis=0), 1e-30)).mean()))
