@@ -1,6 +1,6 @@
 """Whether 95 % intervals of `naibu calibrate` hold, with tied boxes: draws of the virtual dough of ``naibu calibrate --example``.
 
-Run: python benchmarks/tied_calibration.py [--draws 9] [--first 0] [--sensor-errors "offset and delay"]
+Run: python benchmarks/tied_calibration.py [--draws 9] [--first 0] [--sensor-errors "offset and delay"] [--force-drift 0] [--drift 200]
 
 Every draw is a seed of the example: five captures of 2800 points and two force sensors, nine parameters. Printed are simulations and
 processor time of every draw, which truths its intervals miss and by how many standard deviations, and how many are held in all.
@@ -29,6 +29,8 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=9)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sensor-errors", choices=get_args(SensorErrorNames), default="none", help="sought along; the sensors have none")
+    parser.add_argument("--force-drift", type=float, help="standard deviation that is stated, mN/s; by default any drift is counted")
+    parser.add_argument("--drift", type=float, default=0.0, help="that the sensors have along z, mN/s")
     options = parser.parse_args()
     truth = StudyUnknowns.of(prepared_study(SOURCE).study).start
     held, widths = [], []
@@ -36,9 +38,11 @@ def main() -> None:
         began = time.process_time()
         with TemporaryDirectory() as folder:
             study, shapes, forces = write_calibration_example(Path(folder) / "dough", seed=seed)
+            drifted(forces, options.drift)
             found = calibrate_study(
-                study, shapes=[shapes], forces=[forces], out=Path(folder) / "found", sensor_errors=options.sensor_errors
-            ).estimate
+                study, shapes=[shapes], forces=[forces], out=Path(folder) / "found", sensor_errors=options.sensor_errors,
+                force_drift_mn_per_s=options.force_drift,
+            ).estimate  # fmt: skip
         low, high = found.intervals().T
         within = (low <= truth) & (truth <= high)
         off = np.log(found.values / truth) / np.sqrt(np.diag(found.covariance))
@@ -49,6 +53,15 @@ def main() -> None:
     print(f"held: {np.sum(held)} of {np.size(held)}")
     for name, *width in zip(found.unknowns.names, np.min(widths, axis=0), np.max(widths, axis=0), strict=True):
         print(f"half width of the logarithm of {name}: {width[0]:.2f} to {width[1]:.2f}")
+
+
+def drifted(forces: Path, drift_mn_per_s: float) -> None:
+    """Add a drift to the vertical forces of a table, N."""
+    header, *lines = forces.read_text(encoding="utf-8").splitlines()
+    rows = [line.split(",") for line in lines]
+    for row in rows:
+        row[4] = f"{float(row[4]) + 1e-3 * drift_mn_per_s * float(row[0]):.4f}"
+    forces.write_text("\n".join([header, *map(",".join, rows)]) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
