@@ -105,8 +105,9 @@ def problem(
     late_s: float = 0.0,
     offset: float = 0.0,
     drift: float = 0.0,
+    text: str = VOXEL,
 ) -> StudyProblem:
-    study = prepared_study(study_file(folder, VOXEL)).study
+    study = prepared_study(study_file(folder, text)).study
     force = np.zeros((len(times), 3))
     force[:, 2] = np.interp(times - late_s, *clean) + offset + drift * times
     force += NOISE_MN * np.random.default_rng(seed).standard_normal(force.shape)
@@ -208,6 +209,27 @@ def test_a_drift_that_forces_cannot_exclude_is_told_with_what_it_does(tmp_path: 
     assert abs(np.log(moved.values[k] / found.values[k])) == pytest.approx(np.log(told.factor), rel=0.35)
     sought = replace(made, sensor_errors=SensorErrors(offset=True, drift=True, delay=True))
     assert unnoticed_drift(sought, found) is None
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.0047])
+def test_a_delay_is_told_beside_the_inertia_of_what_the_sensor_holds(
+    tmp_path: Path, clean: FloatArray, times: FloatArray, late_s: float
+) -> None:
+    """Half of a voxel of 200 g is moved by the stamp: its force leads as if the clock were early, by many standard deviations."""
+    heavy, deviations = VOXEL.replace("mass_g = 1.0", "mass_g = 200.0"), []
+    fine, force = clean
+    u = np.clip((fine - 0.1) / 0.15, 0.0, 1.0)
+    inertia = -0.1 * DEPTH * (60.0 * u - 180.0 * u**2 + 120.0 * u**3) / 0.15**2  # kg mm/s2 = mN, along z
+    for seed in range(5):
+        for record, wrong in ((force + inertia, False), (force, True)):
+            made = problem(tmp_path, np.stack([fine, record]), times, seed, BOTH, late_s=late_s, text=heavy)
+            found = calibrate_lattice(made, made.unknowns.start, threads=1)
+            told = {error.quantity: error for error in sensor_errors_found(made, found)}["delay"]
+            if not wrong:
+                deviations.append((told.value - late_s) / told.sd)
+            elif seed == 0:
+                assert abs(told.value - late_s) > 3.0 * told.sd
+    assert np.abs(deviations).max() < 3.0 and (np.abs(deviations) < 2.0).sum() >= 4
 
 
 @pytest.mark.parametrize("drift", [0.0, 50.0, 200.0, 500.0])

@@ -47,7 +47,7 @@ def unnoticed_drift(problem: StudyProblem, estimate: LatticeEstimate, found: Rep
     forces, sought = problem.load_cases[0].forces, problem.sensor_errors
     if sought.drift or problem.roughness > 0.0 or not len(forces.force):
         return None
-    drifting = replace(problem, sensor_errors=replace(sought, offset=True, drift=True))
+    drifting = replace(problem, sensor_errors=replace(sought, offset=True, drift=True, drift_sd=np.inf))
     found = found or at_estimate(problem, estimate)
     covariance, variance = fitted(drifting, found).covariance, max(estimate.noise_factor[1], 1.0) ** 2
     half = QUANTILE * np.sqrt(np.diag(estimate.covariance))
