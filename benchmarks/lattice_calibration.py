@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from records import ResultTable, write_record
 
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
-from naibu.identification.lattice_calibration.captured.sensor_errors import SensorErrorNames, SensorErrors
+from naibu.identification.lattice_calibration.captured.sensor_errors import ANY_DRIFT, SensorErrorNames, SensorErrors
 from naibu.identification.lattice_calibration.evaluation import residuals_at
 from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD
 from naibu.identification.lattice_calibration.study_model import StudyModel
@@ -128,7 +128,13 @@ def truth_of(unknowns: StudyUnknowns, rng: np.random.Generator) -> Array:
 
 
 def problem_of(
-    unknowns: StudyUnknowns, truth: Array, pace: float, rng: np.random.Generator, divided: int = 1, sought: SensorErrorNames = "none"
+    unknowns: StudyUnknowns,
+    truth: Array,
+    pace: float,
+    rng: np.random.Generator,
+    divided: int = 1,
+    errors: SensorErrors = ANY_DRIFT,
+    drift: float = 0.0,
 ) -> StudyProblem:
     """Record the truth with steps of time that are shorter than those of the study by `divided`, and set up its identification."""
     study = replace(unknowns.study, step_s=unknowns.study.step_s / divided, sample_steps=unknowns.study.sample_steps * divided)
@@ -143,7 +149,8 @@ def problem_of(
     times = np.arange(0.5 / SENSOR_HZ, steps * study.step_s, 1.0 / SENSOR_HZ)
     at = np.minimum((times / study.step_s).astype(int), steps - 1)
     force = made.force[at, 1] + FORCE_SD_MN * rng.standard_normal((len(times), 3))
-    recorded, errors = RecordedForces.of(unknowns.study, [(1, times, force)]), SensorErrors.named(sought)
+    force[:, 2] += drift * times
+    recorded = RecordedForces.of(unknowns.study, [(1, times, force)])
     return StudyProblem.of(unknowns, clouds, recorded, point_sd_mm=POINT_SD_MM, sensor_errors=errors)
 
 
@@ -155,14 +162,22 @@ def spread(triangles: Array, rng: np.random.Generator) -> Array:
 
 
 def drawn(
-    seed: int, *, cells: int, unknown: str, pace: float = 1.0, threads: int, divided: int = 1, sought: SensorErrorNames = "none"
+    seed: int,
+    *,
+    cells: int,
+    unknown: str,
+    pace: float = 1.0,
+    threads: int,
+    divided: int = 1,
+    errors: SensorErrors = ANY_DRIFT,
+    drift: float = 0.0,
 ) -> Draw:
     """Calibrate one truth."""
     rng = np.random.default_rng([seed, 15])
     with tempfile.TemporaryDirectory() as folder:
         unknowns = unknowns_of(study_of(cells, unknown, pace, Path(folder)), unknown)
     truth = truth_of(unknowns, rng)
-    problem = problem_of(unknowns, truth, pace, rng, divided, sought)
+    problem = problem_of(unknowns, truth, pace, rng, divided, errors, drift)
     began, busy = time.perf_counter(), time.process_time()
     found = searched(problem, unknowns.start, method="gauss-newton", seed=0, max_runs=0, threads=threads, progress=None)
     wall, busy = time.perf_counter() - began, time.process_time() - busy
@@ -200,6 +215,8 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
     parser.add_argument("--divided", type=int, default=1, help="by how much steps of time of the truth are shorter than those of the model")
     parser.add_argument("--sensor-errors", choices=get_args(SensorErrorNames), default="none", help="sought along; the sensor has none")
+    parser.add_argument("--force-drift", type=float, help="standard deviation that is stated, mN/s; by default any drift is counted")
+    parser.add_argument("--drift", type=float, default=0.0, help="that the sensor has along z, mN/s")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1, help="processes, one draw each")
     parser.add_argument("--record", action="store_true")
@@ -216,7 +233,8 @@ def main() -> None:
         pace=chosen.pace,
         threads=threads,
         divided=chosen.divided,
-        sought=chosen.sensor_errors,
+        errors=SensorErrors.named(chosen.sensor_errors, chosen.force_drift),
+        drift=chosen.drift,
     )
     seeds = range(chosen.first, chosen.first + chosen.draws)
     found: list[Draw] = []

@@ -136,11 +136,11 @@ def test_records_that_point_the_other_way_are_refused(inputs: tuple[Path, Path, 
     assert not list((tmp_path / "out").glob("*"))
 
 
-def altered(sensor: Path, *, late_ms: float, offset_n: float) -> None:
-    """Let a record be late, and its sensor not tared along z."""
+def altered(sensor: Path, *, late_ms: float, offset_n: float, drift_n_per_s: float = 0.0) -> None:
+    """Let a record be late, and its sensor not tared along z, or drift."""
     lines = sensor.read_text(encoding="utf-8").splitlines()
     rows = [[float(cell) for cell in line.split(",")] for line in lines[1:]]
-    sensor.write_text("\n".join([lines[0], *(f"{t + late_ms},{x},{y},{z + offset_n}" for t, x, y, z in rows)]), encoding="utf-8")
+    sensor.write_text("\n".join([lines[0], *(f"{t + late_ms},{x},{y},{z + offset_n + 1e-3 * t * drift_n_per_s}" for t, x, y, z in rows)]), encoding="utf-8")
 
 
 def test_a_late_clock_and_a_sensor_that_was_not_tared_are_estimated_and_told(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
@@ -164,6 +164,21 @@ def test_errors_of_a_sensor_that_are_said_not_to_be_there_are_named(inputs: tupl
     assert any("an offset of 0.3" in warning and "perhaps not tared" in warning and "'offset'" in warning for warning in run.warnings)
     low, high = run.estimate.intervals().T
     assert (low < [45.0, 5.0]).all() and (high > [45.0, 5.0]).all()
+
+
+def test_intervals_hold_whatever_a_sensor_drifts_unless_it_is_said_not_to(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    study, _, sensor = inputs
+    altered(sensor, late_ms=0.0, offset_n=0.0, drift_n_per_s=0.2)
+    counted, excluded = (
+        calibrate_study(study, forces=[sensor], out=tmp_path / f"out{k}", groups="all", force_drift_mn_per_s=sd)
+        for k, sd in enumerate((None, 0.0))
+    )
+    low, high = counted.estimate.intervals().T
+    assert (low < [45.0, 5.0]).all() and (high > [45.0, 5.0]).all()
+    assert any("Intervals count any drift" in warning and "force_drift_mn_per_s" in warning for warning in counted.warnings)
+    told = {error["quantity"]: error for error in json.loads(counted.files[1].read_text(encoding="utf-8"))["sensor_errors"]}
+    assert told["drift along z"]["value"] == pytest.approx(200.0, abs=4.0 * told["drift along z"]["sd"])
+    assert any("drift" in warning and "stamp" in warning for warning in excluded.warnings)
 
 
 @pytest.mark.parametrize(

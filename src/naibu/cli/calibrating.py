@@ -41,6 +41,7 @@ def calibrate(
     point_sd_mm: float = 0.5,
     force_sd_mn: float | None = None,
     sensor_errors: Literal["none", "offset", "delay", "offset and delay", "drift", "drift and delay"] = "none",
+    force_drift_mn_per_s: float | None = None,
     max_runs: Whole = 2000,
     seed: Whole = 0,
     threads: Whole = 2,
@@ -81,6 +82,9 @@ def calibrate(
     sensor_errors
         Errors of the force sensors that are estimated along: an offset (they were not tared), a delay of their clocks, a drift (with an
         offset), or none.
+    force_drift_mn_per_s
+        Standard deviation of the drift of a component of a force sensor, mN/s, as from its data sheet; 0 if it has none. By default
+        intervals count any drift since the beginning of a record.
     max_runs
         Number of simulations of a search without derivatives, at most.
     seed
@@ -114,8 +118,9 @@ def calibrate(
 
         run = calibrate_study(
             study, shapes=shapes or (), forces=forces or (), out=out, groups=groups, friction=friction, pull_off=pull_off, method=method,
-            point_sd_mm=point_sd_mm, force_sd_mn=force_sd_mn, sensor_errors=sensor_errors, max_runs=max_runs,
-            seed=seed, threads=threads, starts=starts, overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments,
+            point_sd_mm=point_sd_mm, force_sd_mn=force_sd_mn, sensor_errors=sensor_errors,
+            force_drift_mn_per_s=force_drift_mn_per_s, max_runs=max_runs, seed=seed, threads=threads, starts=starts,
+            overwrite=overwrite, progress=progress, **(where or WorkerOptions()).arguments,
         )  # fmt: skip
     _show(run)
     say(f"{time.perf_counter() - began:.0f} s. Page: {run.files[0]}   numbers: {run.files[1]}   study: {run.files[2]}")

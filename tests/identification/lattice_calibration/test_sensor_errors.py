@@ -15,10 +15,10 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.captured.force_history import SampledMeans
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
-from naibu.identification.lattice_calibration.captured.sensor_errors import NO_ERRORS, SensorErrors
+from naibu.identification.lattice_calibration.captured.sensor_errors import ANY_DRIFT, NO_ERRORS, SensorErrors
 from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
 from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import diagnosed, sensor_errors_found
-from naibu.identification.lattice_calibration.intervals.unnoticed_drift import unnoticed_drift
+from naibu.identification.lattice_calibration.intervals.unnoticed_drift import counted_drift, unnoticed_drift
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
 from naibu.workflows.studies.lattice_study import prepared_study
@@ -105,8 +105,9 @@ def problem(
     late_s: float = 0.0,
     offset: float = 0.0,
     drift: float = 0.0,
+    text: str = VOXEL,
 ) -> StudyProblem:
-    study = prepared_study(study_file(folder, VOXEL)).study
+    study = prepared_study(study_file(folder, text)).study
     force = np.zeros((len(times), 3))
     force[:, 2] = np.interp(times - late_s, *clean) + offset + drift * times
     force += NOISE_MN * np.random.default_rng(seed).standard_normal(force.shape)
@@ -210,6 +211,78 @@ def test_a_drift_that_forces_cannot_exclude_is_told_with_what_it_does(tmp_path: 
     assert unnoticed_drift(sought, found) is None
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.0047])
+def test_a_delay_is_told_beside_the_inertia_of_what_the_sensor_holds(
+    tmp_path: Path, clean: FloatArray, times: FloatArray, late_s: float
+) -> None:
+    """Half of a voxel of 200 g is moved by the stamp: its force leads as if the clock were early, by many standard deviations."""
+    heavy, deviations = VOXEL.replace("mass_g = 1.0", "mass_g = 200.0"), []
+    fine, force = clean
+    u = np.clip((fine - 0.1) / 0.15, 0.0, 1.0)
+    inertia = -0.1 * DEPTH * (60.0 * u - 180.0 * u**2 + 120.0 * u**3) / 0.15**2  # kg mm/s2 = mN, along z
+    for seed in range(5):
+        for record, wrong in ((force + inertia, False), (force, True)):
+            made = problem(tmp_path, np.stack([fine, record]), times, seed, BOTH, late_s=late_s, text=heavy)
+            found = calibrate_lattice(made, made.unknowns.start, threads=1)
+            told = {error.quantity: error for error in sensor_errors_found(made, found)}["delay"]
+            if not wrong:
+                deviations.append((told.value - late_s) / told.sd)
+            elif seed == 0:
+                assert abs(told.value - late_s) > 3.0 * told.sd
+    assert np.abs(deviations).max() < 3.0 and (np.abs(deviations) < 2.0).sum() >= 4
+
+
+@pytest.mark.parametrize("drift", [0.0, 50.0, 200.0, 500.0])
+def test_intervals_hold_whatever_the_drift_that_nobody_sought(tmp_path: Path, clean: FloatArray, times: FloatArray, drift: float) -> None:
+    deviations = []
+    for seed in range(10, 14):
+        made = problem(tmp_path, clean, times, seed, ANY_DRIFT, drift=drift)
+        found = calibrate_lattice(made, made.unknowns.start, threads=1)
+        deviations.append(np.log(found.values / TRUTH) / np.sqrt(np.diag(found.covariance)))
+        assert found.determined().all()
+        listed = {error.quantity: error for error in sensor_errors_found(made, found)}
+        assert listed["drift along z"].value == pytest.approx(drift, abs=3.5 * listed["drift along z"].sd)
+    assert np.abs(deviations).max() < 3.5
+    assert (np.abs(deviations) < 1.96).sum() >= 10
+
+
+def test_intervals_with_a_drift_are_those_of_least_squares_with_its_prior(tmp_path: Path, clean: FloatArray, times: FloatArray) -> None:
+    """Covariance, drift and its standard deviation, against the normal equations of parameters and drift, the prior a row of its own."""
+    sd = 60.0
+    made = problem(tmp_path, clean, times, 3, SensorErrors(drift=True, drift_sd=sd), drift=80.0)
+    values, case = made.unknowns.start, made.load_cases[0]
+    found = case.fine.run(made.unknowns.parameters(values), made.unknowns.changes(values))
+    _, (residual, slopes) = made.weighed(case, found, case.fine.long_step)
+    own = made.of_bodies(case.forces, found)[1]
+    _, (raw, raw_slopes) = replace(made, sensor_errors=NO_ERRORS).weighed(case, found, case.fine.long_step)
+    windows = len(case.forces.force)
+    middle = 0.02 * (np.arange(windows) + 0.5)
+    column = np.sqrt(case.forces.samples[:, 1]) * middle / NOISE_MN
+    columns = np.kron(column[:, None], np.eye(3))
+    p, prior = len(values), np.diag([1.0, 1.0, 1.0, *(np.full(3, sd) ** -2.0)])  # a prior of the parameters, too: they need one there
+    whole = np.hstack([raw_slopes, columns])
+    inverse = np.linalg.inv(whole.T @ whole + prior)
+    covariance = np.linalg.inv(slopes.T @ slopes + np.eye(p))
+    np.testing.assert_allclose(covariance, inverse[:p, :p], rtol=1e-8, atol=1e-14)
+    np.testing.assert_allclose(-covariance @ slopes.T @ residual, (-inverse @ whole.T @ raw)[:p], rtol=1e-6, atol=1e-12)
+    at_values = np.linalg.inv(columns.T @ columns + np.eye(3) / sd**2)
+    np.testing.assert_allclose(own.explained[0], -at_values @ columns.T @ raw, rtol=1e-8)
+    np.testing.assert_allclose(own.explained_variance[0], at_values[2, 2], rtol=1e-8)
+    np.testing.assert_allclose(own.explained_slopes[:, 0], -(at_values @ columns.T @ raw_slopes).T, rtol=1e-6, atol=1e-9)
+
+
+def test_what_a_drift_costs_is_told(tmp_path: Path, clean: FloatArray, times: FloatArray) -> None:
+    made, exact = (problem(tmp_path, clean, times, 4, errors) for errors in (ANY_DRIFT, NO_ERRORS))
+    found, shorter = (calibrate_lattice(each, each.unknowns.start, threads=1) for each in (made, exact))
+    told = counted_drift(made, found)
+    assert told is not None and counted_drift(exact, shorter) is None
+    k = made.unknowns.names.index(told.parameter)
+    assert told.factor == pytest.approx(np.sqrt(found.covariance[k, k] / shorter.covariance[k, k]), rel=0.4)
+    stated = problem(tmp_path, clean, times, 4, SensorErrors(drift=True, drift_sd=0.5))
+    nearly = counted_drift(stated, found)
+    assert nearly is not None and 1.0 < nearly.factor < 1.1
+
+
 def test_forces_that_fit_are_not_diagnosed(tmp_path: Path, clean: FloatArray, times: FloatArray) -> None:
     made = problem(tmp_path, clean, times, 1, BOTH)
     assert diagnosed(made, calibrate_lattice(made, made.unknowns.start, threads=1)) is None
@@ -220,3 +293,8 @@ def test_a_record_too_short_for_errors_of_its_sensor_is_told(tmp_path: Path, cle
         problem(tmp_path, clean, np.arange(0.001, 0.04, 0.001), 0, BOTH)
     with pytest.raises(InputError, match="choose one of none, offset"):
         SensorErrors.named("gain")  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="force_drift_mn_per_s is -1"):
+        SensorErrors.named("none", -1.0)
+    with pytest.raises(InputError, match="leave one of the two out"):
+        SensorErrors.named("drift", 0.0)
+    assert SensorErrors.named("none", 0.0) == replace(NO_ERRORS, drift_sd=0.0) and SensorErrors.named("none") == ANY_DRIFT

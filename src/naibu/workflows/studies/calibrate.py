@@ -87,6 +87,7 @@ def calibrate_study(
     point_sd_mm: float = POINT_SD_MM,
     force_sd_mn: float | None = None,
     sensor_errors: SensorErrorNames = "none",
+    force_drift_mn_per_s: float | None = None,
     max_runs: int = 2000,
     seed: int = 0,
     threads: int = 2,
@@ -121,6 +122,9 @@ def calibrate_study(
     sensor_errors : str
         Errors of the force sensors that are estimated along, of each by itself: an ``"offset"`` of every component (a sensor that was not
         tared), a ``"delay"`` of its clock, a ``"drift"`` (an offset and what grows evenly with time), two of them, or ``"none"``.
+    force_drift_mn_per_s : float
+        Standard deviation of the drift of a component of a force sensor, mN/s, as from its data sheet; 0 if it has none. Values and
+        intervals count it, whatever `sensor_errors` are; by default any drift since the beginning of a record.
     max_runs : int
         Simulations of a search without derivatives, at most.
     seed : int
@@ -146,6 +150,7 @@ def calibrate_study(
         The iterations did not settle.
     """
     _check_arguments(shapes, forces, method, point_sd_mm, force_sd_mn, max_runs, threads, seed, starts)
+    errors = SensorErrors.named(sensor_errors, force_drift_mn_per_s)
     where = _checked_workers(workers, cluster, starts)
     prepared = prepared_study(study)
     if prepared.settings.material is not None and groups != "given":
@@ -154,7 +159,7 @@ def calibrate_study(
         )
     captured, records = read_captured_shapes(shapes) if shapes else (), read_force_records(forces) if forces else ()
     unknowns = StudyUnknowns.of(prepared.study, groups=groups, friction=friction, pull_off=pull_off)
-    problem = _problem(prepared, unknowns, captured, records, point_sd_mm, force_sd_mn, SensorErrors.named(sensor_errors))
+    problem = _problem(prepared, unknowns, captured, records, point_sd_mm, force_sd_mn, errors)
     name = f"{prepared.name}-calibrated.toml"
     folder = output_folder(out, ("calibration.html", "calibration.json", name), overwrite=overwrite)
     before = Compared.of(replace(problem, sensor_errors=NO_ERRORS), unknowns.start)
@@ -165,7 +170,7 @@ def calibrate_study(
     settings = calibrated_settings(prepared.settings, estimate)
     options: dict[str, str | float | int | None] = {
         "study": prepared.source, "method": method, "groups": groups, "friction": friction, "point_sd_mm": point_sd_mm, "seed": seed,
-        "starts": starts, "sensor_errors": sensor_errors,
+        "starts": starts, "sensor_errors": sensor_errors, "force_drift_mn_per_s": force_drift_mn_per_s,
         **{f"SHA-256 of {file}": digest for file, digest in {**prepared.inputs, **_hashes((*shapes, *forces))}.items()},
     }  # fmt: skip
     warnings = (*_warnings_of_starts(several), *told, *_warnings(problem, estimate, before))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -13,10 +12,11 @@ from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import 
     TOLD,
     SensorDiagnosis,
     SensorError,
+    at_estimate,
     diagnosed,
     sensor_errors_found,
 )
-from naibu.identification.lattice_calibration.intervals.unnoticed_drift import UnnoticedDrift, unnoticed_drift
+from naibu.identification.lattice_calibration.intervals.unnoticed_drift import UnnoticedDrift, counted_drift, unnoticed_drift
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 from naibu.viewer.chapters.chapter import Section
 from naibu.viewer.tables import Table
@@ -24,41 +24,50 @@ from naibu.viewer.tables import Table
 LARGE = 0.02  # of the largest force of the record: an offset or a drift that is a warning
 LATE = 0.25  # of a window of time: a delay that is one
 AT_THE_END = 0.95  # of the longest delay that is sought
+WIDER = 1.5  # by which intervals are wider for a drift, from which on a reader is told
 
 
 def sensors_told(problem: StudyProblem, estimate: LatticeEstimate) -> tuple[LatticeEstimate, tuple[SensorError, ...], tuple[str, ...]]:
     """Return an estimate whose intervals reach to where errors that were not sought would move it, errors that were found, and warnings."""
-    diagnosis = diagnosed(problem, estimate) if estimate.finished else None
-    unnoticed = unnoticed_drift(problem, estimate) if estimate.finished and not diagnosis else None
+    found = at_estimate(problem, estimate) if problem.roughness == 0.0 else None  # in contact it takes long, and is rarely needed
+    diagnosis = diagnosed(problem, estimate, found) if estimate.finished else None
+    unnoticed = unnoticed_drift(problem, estimate, found) if estimate.finished and not diagnosis else None
     estimate = diagnosis.estimate if diagnosis else estimate
-    sensors = sensor_errors_found(problem, estimate)
-    return estimate, sensors, _warnings(problem, diagnosis, sensors, unnoticed)
+    sensors = sensor_errors_found(problem, estimate, found)
+    told = _warnings(problem, diagnosis, sensors, unnoticed)
+    counted = counted_drift(problem, estimate, found) if estimate.finished else None
+    if counted and counted.factor > WIDER:
+        told += (
+            f"Intervals count any drift of the force sensors that these forces cannot exclude, as creep looks alike: that of "
+            f"{counted.parameter} is {counted.factor:.2g} times as wide as without one. Where their data sheet says how much the sensors "
+            "drift, state it (force_drift_mn_per_s; 0 if they do not).",
+        )
+    return estimate, sensors, told
 
 
 def _warnings(
     problem: StudyProblem, diagnosis: SensorDiagnosis | None, sensors: Sequence[SensorError], unnoticed: UnnoticedDrift | None
 ) -> tuple[str, ...]:
     """Return in words what a reader must know of the sensors."""
-    found = []
+    found, name = [], _name(problem, diagnosis.errors) if diagnosis else ""
     if diagnosis and diagnosis.told:
         named = ", ".join(f"{error} of {error.body}" for error in diagnosis.told)
         before, after = diagnosis.factors
         found.append(
             f"With {named} the forces would be met to {after:.3g} instead of {before:.3g} times their noise: "
-            f"{_perhaps(diagnosis.errors)}; or the law lacks something that looks alike. Intervals reach to where that would move the "
-            f"estimates. To estimate it along, set sensor_errors to {_name(diagnosis.errors)!r}."
+            f"{_perhaps(problem, diagnosis.errors)}; or the law lacks something that looks alike. Intervals reach to where that would move "
+            f"the estimates. To estimate it along, set sensor_errors to {name!r}."
         )
     elif diagnosis:
         found.append(
-            f"Forces are met better with errors of their sensors ({_name(diagnosis.errors)}), too small to be told from noise: intervals "
-            f"reach to where these would move the estimates. To estimate them along, set sensor_errors to {_name(diagnosis.errors)!r}."
+            f"Forces are met better with errors of their sensors ({name}), too small to be told from noise: intervals "
+            f"reach to where these would move the estimates. To estimate them along, set sensor_errors to {name!r}."
         )
     if unnoticed:
         found.append(
             f"Intervals hold if the sensors do not drift: a drift of {1e-3 * unnoticed.drift_mn_per_s:.2g} N/s on {unnoticed.axis} of "
             f"{unnoticed.body} would hardly show in these forces, as creep looks alike, and would make {unnoticed.parameter} wrong by a "
-            f"factor of {unnoticed.factor:.3g}. Where a sensor may drift so, set sensor_errors to "
-            f"{_name(replace(problem.sensor_errors, offset=True, drift=True))!r}."
+            f"factor of {unnoticed.factor:.3g}. Where a sensor may drift so, leave force_drift_mn_per_s out."
         )
     for error in sensors:
         if abs(error.value) > TOLD * error.sd and _matters(problem, error):
@@ -96,12 +105,14 @@ def _matters(problem: StudyProblem, error: SensorError) -> bool:
     return abs(error.value) * lasts > LARGE * largest
 
 
-def _perhaps(errors: SensorErrors) -> str:
-    told = [("a sensor was perhaps not tared", errors.offset and not errors.drift), ("a sensor perhaps drifts", errors.drift)]
+def _perhaps(problem: StudyProblem, errors: SensorErrors) -> str:
+    drifts = errors.drift and not problem.sensor_errors.drift
+    told = [("a sensor was perhaps not tared", errors.offset and not drifts), ("a sensor perhaps drifts", drifts)]
     told.append(("its clock is perhaps off", errors.delay))
     return ", and ".join(text for text, holds in told if holds)
 
 
-def _name(errors: SensorErrors) -> str:
-    steady = "drift" if errors.drift else "offset" if errors.offset else ""
+def _name(problem: StudyProblem, errors: SensorErrors) -> str:
+    """Return what errors go by; a drift that is counted in any case needs no name."""
+    steady = "drift" if errors.drift and not problem.sensor_errors.drift else "offset" if errors.offset else ""
     return " and ".join(part for part in (steady, "delay" if errors.delay else "") if part)

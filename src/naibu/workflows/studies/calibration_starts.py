@@ -161,7 +161,7 @@ def searched(
 ) -> LatticeEstimate:
     """Search from one start (p,) by a method; weak priors stay around the values that the study states."""
     if method == "gauss-newton":
-        if problem.sensor_errors.any:
+        if problem.sensor_errors.offset or problem.sensor_errors.delay:
             # far from the truth a delay and an offset together make up for wrong parameters: errors are sought from where these fit best
             exact = replace(problem, sensor_errors=NO_ERRORS)
             first = calibrate_lattice(exact, problem.unknowns.start, warm_start=start, widen=False, threads=threads, progress=progress)

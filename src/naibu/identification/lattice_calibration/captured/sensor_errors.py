@@ -35,27 +35,37 @@ class SensorErrors:
     offset : bool
         A constant of each component: the sensor was not tared.
     drift : bool
-        A constant and what grows evenly with time, of each component.
+        What grows evenly with time, of each component; without an offset since the beginning of the record, when it was tared. Creep of
+        the object resembles it so closely that forces may fit to within their noise with parameters far off: where a drift is not known
+        to be none, intervals hold only with it.
     delay : bool
         The clock of each record is late or early, by up to `MOST_DELAY_S`.
+    drift_sd : float
+        Standard deviation of the drift of a component, mN/s, known beforehand (of a data sheet); by default any drift is as likely.
     """
 
     offset: bool = False
     drift: bool = False
     delay: bool = False
+    drift_sd: float = np.inf
 
     @classmethod
-    def named(cls, name: SensorErrorNames) -> SensorErrors:
-        """Return those that go by a name; a drift has an offset.
+    def named(cls, name: SensorErrorNames, drift_sd: float | None = None) -> SensorErrors:
+        """Return those that go by a name; a drift has an offset. All have a drift unless its standard deviation, mN/s, is 0.
 
         Raises
         ------
         InputError
-            Another name.
+            Another name, a negative standard deviation, or one of 0 beside a drift that is sought.
         """
         if name not in get_args(SensorErrorNames):
             raise InputError(f"sensor_errors is {name!r}; choose one of {', '.join(get_args(SensorErrorNames))}")
-        return cls("offset" in name or "drift" in name, "drift" in name, "delay" in name)
+        sd = np.inf if drift_sd is None else drift_sd
+        if not sd >= 0.0:
+            raise InputError(f"force_drift_mn_per_s is {sd:g}: must be 0 or more, mN/s")
+        if "drift" in name and sd == 0.0:
+            raise InputError(f"force_drift_mn_per_s is 0, but sensor_errors is {name!r}; leave one of the two out")
+        return cls("offset" in name or "drift" in name, sd > 0.0, "delay" in name, sd)
 
     @property
     def any(self) -> bool:
@@ -64,15 +74,22 @@ class SensorErrors:
 
     def holds(self, other: SensorErrors) -> bool:
         """Return whether all of another one are among these."""
-        return self.steady >= other.steady and self.delay >= other.delay
+        return self.offset >= other.offset and self.drift >= other.drift and self.delay >= other.delay
 
     @property
     def steady(self) -> int:
         """How many functions of time each component may be off by."""
-        return 2 if self.drift else int(self.offset)
+        return int(self.offset) + int(self.drift)
+
+    def functions(self, times: FloatArray) -> FloatArray:
+        """Return these functions (n, `steady`) at times (n,), s: a constant, and time, 0 in its middle or where the sensor was tared."""
+        columns = [np.ones_like(times)] if self.offset else []
+        if self.drift:
+            columns.append(times - (times.mean() if self.offset else 0.0))
+        return np.stack(columns, axis=1) if columns else np.zeros((len(times), 0))
 
 
-NO_ERRORS = SensorErrors()
+NO_ERRORS, ANY_DRIFT = SensorErrors(), SensorErrors(drift=True)
 SensorErrorNames = Literal["none", "offset", "delay", "offset and delay", "drift", "drift and delay"]
 
 
@@ -87,7 +104,7 @@ class BodyResiduals:
     residual, slopes : ndarray, shape (n, 3), (p, n, 3)
         Of the counted windows.
     explained : ndarray, shape (k, 3)
-        Offset, mN, and what is added every second, mN/s, of each component; as many as were sought.
+        Offset, mN, and what is added every second, mN/s, of each component; as many as there may be.
     explained_slopes : ndarray, shape (p, k, 3)
         How they change with the parameters.
     explained_variance : ndarray, shape (k,)
@@ -95,7 +112,7 @@ class BodyResiduals:
     means : ndarray, shape (windows, 3)
         Simulated means, as late as the clock, mN.
     measured : ndarray, shape (n, 3)
-        Recorded means of the counted windows without the offset, mN.
+        Recorded means of the counted windows without offset and drift, mN.
     delay : float
         s; 0 where none was sought.
     delay_slopes : ndarray, shape (p,)
@@ -146,12 +163,18 @@ def body_residuals(
     seen = record.force[:, body]
     counted = np.asarray(np.isfinite(seen).all(axis=1))
     weight = np.sqrt(record.samples[counted, body])[:, None] / (excess * record.sd_mn[body])
-    middle = record.window_steps * record.step_s * (np.flatnonzero(counted) + 0.5)
-    design = np.power.outer(middle - middle.mean(), np.arange(errors.steady))
+    long_step = record.window_steps * record.step_s
+    since = long_step * (np.flatnonzero(counted) - np.argmax(counted) + 0.5)
+    design = errors.functions(np.asarray(since, dtype=np.float64))
     basis, upper = np.linalg.qr(weight * design)
+    # a normal prior of the last coefficient makes noise larger along the last direction: rows are in units of that noise
+    known = np.abs(upper[-1:, -1:].ravel()) * errors.drift_sd if errors.drift else np.zeros(0)
+    taken = np.ones(basis.shape[1])
+    taken[len(taken) - len(known) :] = 1.0 - 1.0 / np.sqrt(1.0 + known**2)
+    shrunk = taken * (2.0 - taken)  # of coefficients along these directions, 1 without a prior
 
     def without(rows: FloatArray) -> FloatArray:
-        return rows - basis @ (basis.T @ rows)
+        return rows - basis @ (taken[:, None] * (basis.T @ rows))
 
     delay, rate, doubtful = 0.0, np.zeros_like(seen), np.zeros_like(seen)
     if history is not None and (errors.delay or np.abs(record.phase_s[:, body]).max() > EXACT_S):
@@ -161,16 +184,17 @@ def body_residuals(
 
         delay, means, means_change, rate, doubtful = _sampled(record, body, history, cost if errors.delay else None)
     raw, raw_slopes = weight * (means - seen)[counted], weight * means_change[:, counted]
-    residual, slopes = without(raw), raw_slopes - basis @ (basis.T @ raw_slopes)
+    residual, slopes = without(raw), without(raw_slopes)
     along, stiffness = without(weight * rate[counted]) * float(errors.delay), DELAY_SD_S**-2
     variance = 1.0 / (float((along**2).sum()) + stiffness)
     delay_slopes = -variance * np.tensordot(slopes, along, axes=([1, 2], [0, 1]))
     slopes = slopes + delay_slopes[:, None, None] * along
     back = np.linalg.inv(upper)
-    of_delay = back @ basis.T @ (weight * rate[counted])
-    explained_slopes = -(back @ basis.T @ raw_slopes) - delay_slopes[:, None, None] * of_delay
-    spread = (back @ back.T).diagonal() + variance * (of_delay**2).max(axis=1, initial=0.0) * float(errors.delay)
-    explained = -(back @ basis.T @ raw)
+    gain = (back * shrunk) @ basis.T
+    of_delay = gain @ (weight * rate[counted])
+    explained_slopes = -(gain @ raw_slopes) - delay_slopes[:, None, None] * of_delay
+    spread = ((back * shrunk) @ back.T).diagonal() + variance * (of_delay**2).max(axis=1, initial=0.0) * float(errors.delay)
+    explained = -(gain @ raw)
     return BodyResiduals(
         counted, residual, slopes, explained, explained_slopes, spread, means, seen[counted] - design @ explained, delay, delay_slopes,
         variance + (variance * float((along * weight * doubtful[counted]).sum())) ** 2 if errors.delay else 0.0,

@@ -17,7 +17,7 @@ from naibu.identification.lattice_calibration.intervals.model_errors import MISF
 from naibu.identification.lattice_calibration.least_squares import about, unsettled_covariance
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 
-CANDIDATES = tuple(SensorErrors(*map(bool, each)) for each in ((1, 0, 0), (0, 0, 1), (1, 0, 1), (1, 1, 0), (1, 1, 1)))
+CANDIDATES = tuple(SensorErrors(*map(bool, each)) for each in ((1, 0, 0), (0, 0, 1), (1, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1)))
 CHANCE = 0.05  # of an F-test, below which errors are told
 MOVES = 0.5  # standard deviations by which an estimate must move, or its standard deviation grow, for errors to be told
 EXPLAINED = 0.25  # of what the mean square of residuals is above that of noise, from which on errors are told
@@ -77,14 +77,17 @@ class SensorDiagnosis:
     estimate: LatticeEstimate
 
 
-def sensor_errors_found(problem: StudyProblem, estimate: LatticeEstimate) -> tuple[SensorError, ...]:
+def sensor_errors_found(problem: StudyProblem, estimate: LatticeEstimate, found: Reproduced | None = None) -> tuple[SensorError, ...]:
     """Return the errors of all sensors at the values of an estimate, as far as the problem seeks them.
 
     Standard deviations count as well what steps of time leave: twice what errors differ by with half steps (:cite:t:`richardson1911`).
+    In contact, where derivatives take a simulation each, a drift alone is not listed. `found` is what `at_estimate` returns, if known.
     """
-    if not problem.sensor_errors.any or not len(problem.load_cases[0].forces.force):
+    errors = problem.sensor_errors
+    asked = errors.offset or errors.delay or (errors.drift and problem.roughness == 0.0)
+    if not asked or not len(problem.load_cases[0].forces.force):
         return ()
-    listed = _listed(problem, at_estimate(problem, estimate), estimate.covariance, max(estimate.noise_factor[1], 1.0) ** 2)
+    listed = _listed(problem, found or at_estimate(problem, estimate), estimate.covariance, max(estimate.noise_factor[1], 1.0) ** 2)
     if (halved := problem.with_half_steps()) is None:
         return listed
     finer = halved.load_cases[0].fine.run(problem.unknowns.parameters(estimate.values))
@@ -94,23 +97,24 @@ def sensor_errors_found(problem: StudyProblem, estimate: LatticeEstimate) -> tup
     )
 
 
-def diagnosed(problem: StudyProblem, estimate: LatticeEstimate) -> SensorDiagnosis | None:
+def diagnosed(problem: StudyProblem, estimate: LatticeEstimate, found: Reproduced | None = None) -> SensorDiagnosis | None:
     """Return which errors of the sensors, beyond those that were sought, would explain what the forces lack; None if none would.
 
     Residuals of all candidates come from one simulation with derivatives at the estimate; the parameters move along linearly. Those
     that explain less than a quarter, or what chance would (F-test), do not count; of others the fewest that leave hardly more than the
     best. A law that lacks something may look alike: nothing is corrected by them, but intervals reach to where they would move the
     estimate, and are as wide as beside them. In contact, where differences of simulations make up for anything, forces must be off by more
-    than their noise.
+    than their noise. `found` is what `at_estimate` returns, if known.
     """
     if problem.roughness > 0.0 and not estimate.noise_factor[1] ** 2 > MISFIT:
         return None
-    found = at_estimate(problem, estimate)
+    found = found or at_estimate(problem, estimate)
     before, count = fitted(problem, found), int(np.isfinite(problem.load_cases[0].forces.force).sum())
     if not count:
         return None
     fits = []
     for errors in CANDIDATES:
+        errors = replace(errors, drift_sd=problem.sensor_errors.drift_sd) if problem.sensor_errors.drift else errors
         after = fitted(replace(problem, sensor_errors=errors), found)
         more, free = after.unknowns - before.unknowns, max(count - after.unknowns, 1)
         if more > 0 and errors.holds(problem.sensor_errors):
@@ -172,20 +176,21 @@ def _listed(
     listed: list[SensorError] = []
     for body, own in problem.of_bodies(problem.load_cases[0].forces, found).items():
         moved = np.zeros(len(covariance)) if step is None else step
-        listed += _of_body(names[body], own, covariance, variance, moved, delay=problem.sensor_errors.delay)
+        listed += _of_body(names[body], own, covariance, variance, moved, problem.sensor_errors)
     return tuple(listed)
 
 
 def _of_body(
-    name: str, own: BodyResiduals, covariance: FloatArray, variance: float, step: FloatArray, *, delay: bool
+    name: str, own: BodyResiduals, covariance: FloatArray, variance: float, step: FloatArray, errors: SensorErrors
 ) -> Sequence[SensorError]:
     def error(quantity: str, value: float, known: float, slopes: FloatArray, unit: str) -> SensorError:
         spread = variance * known + slopes @ covariance @ slopes
         return SensorError(name, quantity, float(value + slopes @ step), float(np.sqrt(spread)), unit)
 
+    steady = [named for named, sought in ((("offset", "mN"), errors.offset), (("drift", "mN/s"), errors.drift)) if sought]
     listed = [
         error(f"{what} along {axis}", own.explained[k, a], own.explained_variance[k], own.explained_slopes[:, k, a], unit)
-        for k, (what, unit) in enumerate((("offset", "mN"), ("drift", "mN/s"))[: len(own.explained)])
+        for k, (what, unit) in enumerate(steady)
         for a, axis in enumerate("xyz")
     ]
-    return [*listed, error("delay", own.delay, own.delay_variance, own.delay_slopes, "s")] if delay else listed
+    return [*listed, error("delay", own.delay, own.delay_variance, own.delay_slopes, "s")] if errors.delay else listed
