@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, add_earlier_forces, contact_change
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import LipsBesideTangent
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, LipsBesideTangent, change_in_threes, in_threes
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
@@ -84,9 +84,10 @@ class CondensedContact:
     tangent : EarlierTangent
         The body.
     nodes : ndarray, shape (k,), int64
-        Their numbers in the body.
+        Their numbers in the body. Behind them come the pairs of the tangent whose approach is condensed, in rows of three: what is said of
+        nodes (k, 3) below is said of their approach as well.
     stiffness : ndarray, shape (k,)
-        Of the elements at the nodes, mN/mm.
+        Of the elements at the nodes, mN/mm, and at the pairs.
     gripped : ndarray, shape (g,), int64
         Other nodes, which do not move.
     balanced : bool
@@ -106,13 +107,28 @@ class CondensedContact:
     _held_by: float = field(init=False, default=0.0)  # the share that `_changed` contains
 
     def __post_init__(self) -> None:
-        free = 3 * len(self.nodes)
-        whole = self.tangent.factors.between(np.concatenate([self.nodes, self.gripped]))
+        whole = self._with_pairs(self.tangent.factors.between(np.concatenate([self.nodes, self.gripped])))
+        free = len(whole) - 3 * len(self.gripped)
         self._inverse, self._carried = whole, np.zeros((0, free), dtype=np.float32)
         if len(self.gripped):
             self._holding = la.lu_factor(whole[free:, free:].astype(np.float64), check_finite=False)
             self._carried = np.asarray(la.lu_solve(self._holding, whole[free:, :free], check_finite=False), dtype=np.float32)
             self._inverse = np.asfortranarray(whole[:free, :free] - whole[:free, free:] @ self._carried)
+
+    def _with_pairs(self, between: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the part of the inverse between nodes, pairs and gripped nodes, from that between nodes and gripped nodes."""
+        pairs, own = self.tangent.pairs, 3 * len(self.nodes)
+        count = len(pairs.numbers)
+        if count == 0:
+            return between
+        rows = 3 * -(-count // 3)
+        whole = np.zeros((len(between) + rows, len(between) + rows), dtype=np.float32, order="F")
+        place = np.concatenate([np.arange(own), np.arange(own + rows, len(whole))])
+        across = pairs.under(self.tangent.factors, np.concatenate([self.nodes, self.gripped]))
+        whole[np.ix_(place, place)] = between
+        whole[own : own + count, place], whole[place, own : own + count] = across, across.T
+        whole[own : own + count, own : own + count] = pairs.inverse
+        return whole
 
     def serves(self, tangent: EarlierTangent, nodes: IntArray, gripped: IntArray) -> bool:
         """Whether these nodes (l,) are among those of the same body, of which the same ones are gripped."""
@@ -298,6 +314,8 @@ class ContactBesideTangent:
         Of the surface.
     tangent : EarlierTangent
         With its contacts.
+    sides : ApproachingLips, optional
+        Pairs of the sides of cuts whose approach is condensed, in rows of three behind the nodes.
     """
 
     nodes: IntArray
@@ -306,6 +324,7 @@ class ContactBesideTangent:
     places: Sequence[Int32Array]
     pattern: BlockPattern
     tangent: EarlierTangent
+    sides: ApproachingLips | None = None
     exerted: float = field(init=False, default=0.0)
     _place: IntArray = field(init=False)
 
@@ -316,6 +335,7 @@ class ContactBesideTangent:
     def __call__(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
         moved, force = self.displacement.copy(), np.zeros_like(self.displacement)
+        motion, behind = motion[: len(self.nodes)], motion[len(self.nodes) :]
         moved[self.nodes] += motion
         pattern = self.pattern
         add_earlier_forces(pattern.indptr, pattern.indices, self.tangent.contact, self.nodes, self._place, motion, force)
@@ -324,18 +344,23 @@ class ContactBesideTangent:
             contact.add_force(moved, own if isinstance(contact, NearbyContact) else force)
         sides = sum(contact.exerted for contact in self.contacts if isinstance(contact, LipsBesideTangent))
         self.exerted = float(np.abs(own).sum()) + sides
-        return np.asarray((force + own)[self.nodes])
+        if self.sides is None:
+            return np.asarray((force + own)[self.nodes])
+        across = in_threes(self.sides.forces(behind.ravel()[: len(self.sides.gap)]))
+        self.exerted += self.sides.exerted
+        return np.concatenate([(force + own)[self.nodes], across])
 
     def change(self) -> BlockChange:
         """Return the stiffness at the last motion; see `ContactLaw`."""
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
         for contact, places in zip(self.contacts, self.places, strict=True):
             contact.touching().add_secant_stiffness(self.pattern, places, blocks)
-        return self._beside(blocks)
+        return self._beside(blocks, self.sides.change() if self.sides else None)
 
     def opened(self) -> BlockChange:
         """Return minus the stiffness of the contacts that the tangent contains; see `ContactLaw`."""
-        return self._beside(np.zeros((self.pattern.n_blocks, 3, 3)))
+        return self._beside(np.zeros((self.pattern.n_blocks, 3, 3)), self.sides.opened() if self.sides else None)
 
-    def _beside(self, blocks: FloatArray) -> BlockChange:
-        return contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place)
+    def _beside(self, blocks: FloatArray, across: FloatArray | None) -> BlockChange:
+        change = contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place)
+        return change if across is None else change.and_also(change_in_threes(across, len(self.nodes)))
