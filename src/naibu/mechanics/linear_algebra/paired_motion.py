@@ -60,6 +60,11 @@ class PairedMotion:
         empty = np.zeros(0, dtype=np.int64)
         return cls(empty, empty.reshape(0, 2), np.zeros((0, 3)), np.zeros((0, 0), dtype=np.float32))
 
+    @property
+    def n_pairs(self) -> int:
+        """Number of pairs."""
+        return len(self.numbers)
+
     def under(self, factors: UpdatedFactors, nodes: IntArray) -> NDArray[np.float32]:
         """Return the relative motion (p, 3 k) under unit forces on nodes (k,), whose part of the inverse is known."""
         return factors.of_columns(nodes, lambda columns: relative(columns, self.nodes, self.directions).astype(np.float32))

@@ -44,6 +44,12 @@ class BlockChange:
             np.concatenate([self.columns, first + other.columns]), np.concatenate([self.blocks, other.blocks]),
         )  # fmt: skip
 
+    def times(self, motion: FloatArray) -> FloatArray:
+        """Return the product (m, 3) with a motion (m, 3) of all m nodes."""
+        out = np.zeros_like(motion)
+        np.add.at(out, self.nodes[self.rows], np.einsum("bij,bj->bi", self.blocks, motion[self.nodes[self.columns]]))
+        return out
+
     def with_springs(self, stiffness: FloatArray) -> BlockChange:
         """Return the change with springs (m,) beside it, which hold each of all m nodes where it is."""
         held = np.flatnonzero(stiffness)

@@ -47,6 +47,9 @@ SLOW = 0.7  # of what was left: mean progress of a step from which another matri
 JUMP = 3.0  # growth of what is left from which it is at once
 USUAL = 6  # evaluations after which ten times the tolerance is enough
 BALANCED = 0.003  # of the forces: how much those of the motion that they lead to may differ, where hardly any motion is left
+DOWNHILL = 2  # times as many matrices where steps end when the forces that are left do no more work
+LEFT = 0.5  # of the work at the beginning of such a step: what may be left at its end
+SEARCHED = 8  # ends of a step that are tried
 ENOUGH = 0.005  # likewise, where no further matrix is worth while
 
 
@@ -118,7 +121,7 @@ class CondensedContact:
     def _with_pairs(self, between: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return the part of the inverse between nodes, pairs and gripped nodes, from that between nodes and gripped nodes."""
         pairs, own = self.tangent.pairs, 3 * len(self.nodes)
-        count = len(pairs.numbers)
+        count = pairs.n_pairs
         if count == 0:
             return between
         rows = 3 * -(-count // 3)
@@ -238,6 +241,8 @@ class _Search:
             if body._changed is None or useless:
                 if self._consistent(at, ENOUGH):
                     return at, True
+                if changes and body.tangent.pairs.n_pairs:
+                    return (yield from self._downhill(best, DOWNHILL * most))
                 if changes == most or cut_short > far or (changes and time.thread_time() > self.until):
                     break
                 yield
@@ -257,6 +262,57 @@ class _Search:
             if at.size < best.size:
                 best = at
         return best, False
+
+    def _downhill(self, at: _Motion, most: int) -> Generator[None, None, tuple[_Motion, bool]]:
+        """Return the best that steps of Newton's method find from a motion, with at most so many matrices, and whether it is a balance.
+
+        Hundreds of pairs that open and close at once let such steps go much too far. The energy of pairs without friction is convex: along
+        every step, the forces that are left do work until it is least, and there the step ends. They are left of the forces under which a
+        motion is ``y = free + W f``, which a whole step determines.
+        """
+        law, nodes, best, exerted = self.law, len(self.body.nodes), at, None
+        law(at.motion)
+        for _ in range(most):
+            if time.thread_time() > self.until:
+                break
+            yield
+            change = law.change().with_springs(self._springs)
+            self.body._changed = changed = ChangedInverse.of(self.body._inverse, change)
+            step = -changed.solve(at.left)
+            resisted = change.times(step)
+            share = min(1.0, self.longest_mm / max(float(np.abs(step[:nodes]).max(initial=0.0)), 1e-300))
+            if exerted is None:
+                if share < 1.0:
+                    break
+                exerted = at.force - resisted
+            else:
+                further = at.force - exerted - resisted
+                share = self._least(at.motion, exerted, step, further, share)
+                exerted = exerted + share * further
+            at = self._tried(at.motion + share * step)
+            best = at if at.size < best.size else best
+            if at.size <= 10.0 * self.tolerance_mm and self._consistent(at, ENOUGH):
+                return at, True
+        return best, False
+
+    def _least(self, motion: FloatArray, exerted: FloatArray, step: FloatArray, further: FloatArray, most: float) -> float:
+        """Return the share of a step, and of the change of forces along it, at which the forces that are left do nearly no work on it."""
+
+        def work(share: float) -> float:
+            left = exerted + share * further - self._forces(motion + share * step)
+            return float((left * step).sum())
+
+        low, high, first = 0.0, most, work(0.0)
+        at_low, at_high = first, work(most)
+        for _ in range(SEARCHED):
+            if abs(at_high) <= LEFT * abs(first) or at_high < 0.0:
+                break
+            share = low + (high - low) * min(max(at_low / (at_low - at_high), 0.1), 0.9)
+            now = work(share)
+            if abs(now) <= LEFT * abs(first):
+                return share
+            low, at_low, high, at_high = (share, now, high, at_high) if now < 0.0 else (low, at_low, share, now)
+        return high
 
     def _tried(self, motion: FloatArray) -> _Motion:
         force = self._forces(motion)

@@ -369,7 +369,7 @@ class RealTimeSession(DividedSession):
 
     def _approaching(self, tangent: EarlierTangent, displacement: FloatArray) -> ApproachingLips | None:
         """Return the pairs of the sides of cuts whose approach a tangent knows, at a displacement (n, 3), mm."""
-        known = len(tangent.pairs.numbers) > 0
+        known = tangent.pairs.n_pairs > 0
         return ApproachingLips.of(lips_of(self._elements.assembler)[0], tangent, displacement) if known else None
 
     def _stiffness_at(self, nodes: IntArray, tangent: EarlierTangent) -> FloatArray:
