@@ -142,6 +142,10 @@ class CondensedContact:
         """Return the motion of the nodes (k, 3), mm, if the gripped ones are held, from those (k, 3) and (g, 3) without grip."""
         return free - (gripped.ravel() @ self._carried).reshape(-1, 3)
 
+    def moved(self, alone: FloatArray, force: FloatArray) -> FloatArray:
+        """Return the motion of the nodes (k, 3), mm, under forces (k, 3), mN, from that without them."""
+        return alone + (self._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
+
     def holding(self, gripped: FloatArray, force: FloatArray) -> FloatArray:
         """Return what holds the gripped nodes (g, 3), mN, from their motion (g, 3) without grip and the forces on the others (k, 3)."""
         if len(gripped) == 0:
@@ -316,7 +320,7 @@ class _Search:
 
     def _tried(self, motion: FloatArray) -> _Motion:
         force = self._forces(motion)
-        left = motion - self.free - (self.body._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
+        left = motion - self.body.moved(self.free, force)
         return _Motion(motion, force, left, float(np.abs(left).max(initial=0.0)))
 
     def _forces(self, motion: FloatArray) -> FloatArray:

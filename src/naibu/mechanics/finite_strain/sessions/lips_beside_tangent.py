@@ -167,8 +167,8 @@ def approaching(lips: CutLips, tangent: EarlierTangent) -> IntArray:
 class ApproachingLips:
     """Forces across pairs beside those that an earlier tangent contains, at their approach along their normals.
 
-    A tangent holds pairs along their normals of then. That the sides slide beside the normals meanwhile is left to the iterations of the
-    whole body.
+    A tangent holds pairs along their normals of then, and how they move one another is known along these. That the normals have turned
+    meanwhile changes the gap by as much as the sides slide, which hardly depends on what presses across them.
 
     Attributes
     ----------
@@ -176,8 +176,8 @@ class ApproachingLips:
         The pairs that a tangent knows, in its order, with the normals of the step.
     active : ndarray, shape (p,), bool
         Which of them take part.
-    directions : ndarray, shape (p, 3)
-        Normals, those of the tangent where the sides do not face each other any more; zero where a pair takes no part.
+    normals, directions : ndarray, shape (p, 3)
+        Normals now, and those of the tangent; zero where a pair takes no part.
     gap : ndarray, shape (p,)
         Where they are, mm; negative where they press.
     earlier : ndarray, shape (p,)
@@ -186,11 +186,13 @@ class ApproachingLips:
 
     lips: CutLips
     active: BoolArray
+    normals: FloatArray
     directions: FloatArray
     gap: FloatArray
     earlier: FloatArray
     exerted: float = field(init=False, default=0.0)
     _at: FloatArray = field(init=False)
+    _turned: FloatArray = field(init=False)  # what gaps change by as normals have turned, mm
     _before: FloatArray = field(init=False)
 
     @classmethod
@@ -202,28 +204,39 @@ class ApproachingLips:
         active = np.isin(known.numbers, approaching(lips, tangent))
         assert own.normals is not None
         along = np.where(own.normals.any(axis=1)[:, None], own.normals, known.directions)
-        return cls(own, active, np.where(active[:, None], along, 0.0), own.gaps(displacement), earlier)
+        now, then = (np.where(active[:, None], unit, 0.0) for unit in (along, known.directions))
+        return cls(own, active, now, then, own.gaps(displacement), earlier)
 
     def __post_init__(self) -> None:
-        self._at = np.zeros(len(self.gap))
+        self._at, self._turned = np.zeros(len(self.gap)), np.zeros(len(self.gap))
         self._before = self._across(self.gap)
 
     def motion(self, displacement: FloatArray) -> FloatArray:
-        """Return by how much the sides of each pair go apart (p,), mm, as nodes are displaced (n, 3), mm."""
+        """Return by how much the sides of each pair go apart along the normals of the tangent (p,), mm, from displacements (n, 3), mm."""
         return relative(displacement.ravel(), self.lips.pairs, self.directions)
+
+    def slide(self, displacement: FloatArray) -> None:
+        """Have the sides slide as nodes are displaced (n, 3), mm."""
+        self._turned = relative(displacement.ravel(), self.lips.pairs, self.normals - self.directions)
 
     def forces(self, apart: FloatArray) -> FloatArray:
         """Return the forces (p,), mN, that part the sides, where they have gone apart (p,), mm, less those that the tangent has."""
-        self._at = self.gap + apart
+        self._at = self.gap + self._turned + apart
         pressing = self._across(self._at)
-        self.exerted = 2.0 * float(pressing @ np.abs(self.directions).sum(axis=1))
+        self.exerted = 2.0 * float(pressing @ np.abs(self.normals).sum(axis=1))
         return np.asarray(np.where(self.active, pressing - self._before + self.earlier * apart, 0.0))
 
-    def on_nodes(self, amounts: FloatArray, held: IntArray, n_points: int) -> FloatArray:
-        """Return the forces (3 n,) of amounts in rows of three, mN, on the nodes of the body, of which some (h,) are held."""
-        force = forces_along(amounts.ravel()[: len(self.gap)], self.lips.pairs, self.directions, n_points).reshape(-1, 3)
-        force[held] = 0.0
-        return force.ravel()
+    def on_nodes(self, amounts: FloatArray, apart: FloatArray, held: IntArray, n_points: int) -> FloatArray:
+        """Return the forces (3 n,), mN, on the nodes of the body, of which some (h,) are held, of those on pairs.
+
+        Both the forces of pairs and their motion, mm, are in rows of three.
+        """
+        many = len(self.gap)
+        of_tangent = np.where(self.active, self.earlier * apart.ravel()[:many], 0.0)
+        force = forces_along(of_tangent, self.lips.pairs, self.directions, n_points)
+        force += forces_along(amounts.ravel()[:many] - of_tangent, self.lips.pairs, self.normals, n_points)
+        force.reshape(-1, 3)[held] = 0.0
+        return force
 
     def change(self) -> FloatArray:
         """Return the stiffness (p,), mN/mm, at the last forces, less that of the tangent."""

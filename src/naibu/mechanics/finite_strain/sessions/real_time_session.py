@@ -358,12 +358,15 @@ class RealTimeSession(DividedSession):
             limits = (RUBBING, RUBBING) if self.engine.assembler.unsymmetric else (CHANGES, UNAIDED)
             still, begins = (np.concatenate([motion[nodes], *_of_sides(sides, motion)]) for motion in (free, begin))
             alone = condensed.held(still, free[gripped])
+            if sides is not None:
+                sides.slide(free)
             force = yield from condensed.forces(alone, law, begins, 1e-5 * extent, longest, faint, *limits, self._patience)
             holding = condensed.holding(free[gripped], force)
-            own, across = force[: len(nodes)], force[len(nodes) :]
-            tangent.factors.add_columns(np.concatenate([nodes, gripped]), np.concatenate([own, holding]), x)
+            behind = len(nodes)
+            tangent.factors.add_columns(np.concatenate([nodes, gripped]), np.concatenate([force[:behind], holding]), x)
             if sides is not None:
-                x += tangent.factors.solve(sides.on_nodes(across, tangent.held, len(free)))
+                apart = condensed.moved(alone, force)[behind:]
+                x += tangent.factors.solve(sides.on_nodes(force[behind:], apart, tangent.held, len(free)))
         free[self._constrained] = 0.0
         return free
 
