@@ -130,7 +130,7 @@ class CutLips:
         gap, normal = self.gaps_and_normals(displacement)
         traction, blocks = np.zeros_like(normal), np.zeros((len(gap), 3, 3))
         self._rubbed(gap, normal, self._relative(displacement), np.zeros_like(displacement), blocks, traction)
-        return _across(gap, self.area, self.edge, self.stiffness), traction
+        return across(gap, self.area, self.edge, self.stiffness), traction
 
     def rubbing(self, displacement: FloatArray) -> float:
         """Return the sum of the components of friction on both sides, mN, at a displacement (n, 3), mm."""
@@ -186,7 +186,7 @@ class CutLips:
     ) -> float:
         """Add friction to internal forces and stiffnesses, put that of the pairs in place, and return what is stored in elastic slip."""
         anchors = self._relative(np.zeros_like(self.points)) if self.anchors is None else self.anchors
-        pressing = _across(gap, self.area, self.edge, self.stiffness)
+        pressing = across(gap, self.area, self.edge, self.stiffness)
         slope = np.where(gap > -RAMP * self.edge, -gap / (RAMP * self.edge), 1.0) * self.stiffness * self.area
         tangential = TANGENTIAL * self.stiffness * self.area
         shift = relative - anchors
@@ -311,7 +311,7 @@ def _carriers(points: FloatArray, cells: IntArray, pairs: IntArray, normal: Floa
     return np.ascontiguousarray(nodes, dtype=np.int64), pair, np.ascontiguousarray(carried)
 
 
-def _across(gap: FloatArray, area: FloatArray, edge: FloatArray, stiffness: FloatArray) -> FloatArray:
+def across(gap: FloatArray, area: FloatArray, edge: FloatArray, stiffness: FloatArray) -> FloatArray:
     """Return the forces across the sides (p,), mN, of pairs with these gaps: those of `add_pressure`."""
     k, ramp = stiffness * area, RAMP * edge
     closed = np.minimum(gap, 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,6 +35,20 @@ class BlockChange:
     rows: IntArray
     columns: IntArray
     blocks: FloatArray
+
+    def and_also(self, other: BlockChange) -> BlockChange:
+        """Return this change and another one of nodes behind those of this one."""
+        first = len(self.nodes)
+        return BlockChange(
+            np.concatenate([self.nodes, other.nodes]), np.concatenate([self.rows, first + other.rows]),
+            np.concatenate([self.columns, first + other.columns]), np.concatenate([self.blocks, other.blocks]),
+        )  # fmt: skip
+
+    def times(self, motion: FloatArray) -> FloatArray:
+        """Return the product (m, 3) with a motion (m, 3) of all m nodes."""
+        out = np.zeros_like(motion)
+        np.add.at(out, self.nodes[self.rows], np.einsum("bij,bj->bi", self.blocks, motion[self.nodes[self.columns]]))
+        return out
 
     def with_springs(self, stiffness: FloatArray) -> BlockChange:
         """Return the change with springs (m,) beside it, which hold each of all m nodes where it is."""
@@ -115,6 +129,18 @@ class UpdatedFactors:
     def solve(self, b: FloatArray) -> FloatArray:
         """Return x of ``A x = b`` for b of shape (3 n,)."""
         return np.asarray(self.factors.solve(b), dtype=np.float64)
+
+    def solve_all(self, b: FloatArray) -> FloatArray:
+        """Return the solutions (3 n, r) for right sides (3 n, r) in the order of columns."""
+        return np.asarray(self.factors.solve(b))
+
+    def of_columns(self, nodes: IntArray, of: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> NDArray[np.float32]:
+        """Return what a linear function makes of the columns (3 n, 3 k) of the inverse that belong to nodes (k,): (p, 3 k)."""
+        self._add(np.unique(nodes[self._slot[nodes] < 0]))
+        known = [of(columns) for columns in self._columns]
+        return (
+            np.concatenate(known, axis=1)[:, _rows(self._slot[nodes])] if len(nodes) else of(np.zeros((3 * self.n_points, 0), np.float32))
+        )
 
     def between(self, nodes: IntArray) -> NDArray[np.float32]:
         """Return the part of the inverse (3 k, 3 k) between nodes (k,), in the order of columns."""

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Generator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy.sparse as sp
+from scipy.optimize import nnls
 
 from naibu.core.arrays import FloatArray
 from naibu.mechanics.finite_strain.sessions.condensed_contact import UNAIDED, CondensedContact
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
+from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse, UpdatedFactors
 
 BODY, WALL, GAP = 10.0, 1e4, 0.5  # mN/mm, mN/mm, mm
@@ -228,3 +231,40 @@ def test_light_contact_is_balanced_as_well_as_heavy_contact(pressed: float) -> N
     reached = free + force / BODY
     np.testing.assert_allclose(force, SoftWall()(reached), atol=0.02 * np.abs(force).sum())
     assert force[0, 2] < 0.0
+
+
+class Sides:
+    """Pairs that resist their approach beyond a gap, in rows of three."""
+
+    def __init__(self, gap: FloatArray) -> None:
+        self.gap, self.deep, self.exerted = gap, np.zeros_like(gap), 0.0
+
+    def __call__(self, motion: FloatArray) -> FloatArray:
+        self.deep = np.maximum(-(self.gap + motion), 0.0)
+        self.exerted = WALL * float(self.deep.sum())
+        return WALL * self.deep
+
+    def change(self) -> BlockChange:
+        rows = np.flatnonzero((self.deep > 0.0).any(axis=1))
+        places = np.arange(len(rows))
+        return BlockChange(rows, places, places, WALL * (self.deep[rows] > 0.0)[:, :, None] * np.eye(3))
+
+    def opened(self) -> BlockChange:
+        none = np.zeros(0, np.int64)
+        return BlockChange(none, none, none, np.zeros((0, 3, 3)))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_pairs_that_open_and_close_at_once_are_those_of_the_quadratic_programme(seed: int) -> None:
+    random, count = np.random.default_rng(seed), 90
+    springs = random.standard_normal((count, count))
+    inverse = springs @ springs.T / count**2 + 1e-4 * np.eye(count)  # loose pieces: few motions that are a thousand times as free
+    still, gap = random.standard_normal(count), 0.05 * random.random(count)
+    tangent, none = factorized(BODY * np.eye(3)), np.zeros(0, np.int64)
+    pairs = PairedMotion(np.arange(count), np.zeros((count, 2), np.int64), np.zeros((count, 3)), inverse.astype(np.float32))
+    contact = CondensedContact(replace(tangent, pairs=pairs), none, np.full(count // 3, BODY))
+    found = found_by(contact.forces(still.reshape(-1, 3), Sides(gap.reshape(-1, 3)), np.zeros((count // 3, 3)), 1e-5, 1e9, 1e-6))
+    root = np.linalg.cholesky(inverse + np.eye(count) / WALL).T  # least of |root f + root^-T (gap + still)|, f not negative
+    expected = nnls(root, -np.linalg.solve(root.T, gap + still), maxiter=100 * count)[0]
+    np.testing.assert_allclose(found.ravel(), expected, atol=2e-3 * expected.max())
+    assert contact.balanced

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, add_earlier_forces, contact_change
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import LipsBesideTangent
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, LipsBesideTangent, change_in_threes, in_threes
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
@@ -47,6 +47,9 @@ SLOW = 0.7  # of what was left: mean progress of a step from which another matri
 JUMP = 3.0  # growth of what is left from which it is at once
 USUAL = 6  # evaluations after which ten times the tolerance is enough
 BALANCED = 0.003  # of the forces: how much those of the motion that they lead to may differ, where hardly any motion is left
+DOWNHILL = 2  # times as many matrices where steps end when the forces that are left do no more work
+LEFT = 0.5  # of the work at the beginning of such a step: what may be left at its end
+SEARCHED = 8  # ends of a step that are tried
 ENOUGH = 0.005  # likewise, where no further matrix is worth while
 
 
@@ -84,9 +87,10 @@ class CondensedContact:
     tangent : EarlierTangent
         The body.
     nodes : ndarray, shape (k,), int64
-        Their numbers in the body.
+        Their numbers in the body. Behind them come the pairs of the tangent whose approach is condensed, in rows of three: what is said of
+        nodes (k, 3) below is said of their approach as well.
     stiffness : ndarray, shape (k,)
-        Of the elements at the nodes, mN/mm.
+        Of the elements at the nodes, mN/mm, and at the pairs.
     gripped : ndarray, shape (g,), int64
         Other nodes, which do not move.
     balanced : bool
@@ -106,13 +110,28 @@ class CondensedContact:
     _held_by: float = field(init=False, default=0.0)  # the share that `_changed` contains
 
     def __post_init__(self) -> None:
-        free = 3 * len(self.nodes)
-        whole = self.tangent.factors.between(np.concatenate([self.nodes, self.gripped]))
+        whole = self._with_pairs(self.tangent.factors.between(np.concatenate([self.nodes, self.gripped])))
+        free = len(whole) - 3 * len(self.gripped)
         self._inverse, self._carried = whole, np.zeros((0, free), dtype=np.float32)
         if len(self.gripped):
             self._holding = la.lu_factor(whole[free:, free:].astype(np.float64), check_finite=False)
             self._carried = np.asarray(la.lu_solve(self._holding, whole[free:, :free], check_finite=False), dtype=np.float32)
             self._inverse = np.asfortranarray(whole[:free, :free] - whole[:free, free:] @ self._carried)
+
+    def _with_pairs(self, between: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the part of the inverse between nodes, pairs and gripped nodes, from that between nodes and gripped nodes."""
+        pairs, own = self.tangent.pairs, 3 * len(self.nodes)
+        count = pairs.n_pairs
+        if count == 0:
+            return between
+        rows = 3 * -(-count // 3)
+        whole = np.zeros((len(between) + rows, len(between) + rows), dtype=np.float32, order="F")
+        place = np.concatenate([np.arange(own), np.arange(own + rows, len(whole))])
+        across = pairs.under(self.tangent.factors, np.concatenate([self.nodes, self.gripped]))
+        whole[np.ix_(place, place)] = between
+        whole[own : own + count, place], whole[place, own : own + count] = across, across.T
+        whole[own : own + count, own : own + count] = pairs.inverse
+        return whole
 
     def serves(self, tangent: EarlierTangent, nodes: IntArray, gripped: IntArray) -> bool:
         """Whether these nodes (l,) are among those of the same body, of which the same ones are gripped."""
@@ -122,6 +141,10 @@ class CondensedContact:
     def held(self, free: FloatArray, gripped: FloatArray) -> FloatArray:
         """Return the motion of the nodes (k, 3), mm, if the gripped ones are held, from those (k, 3) and (g, 3) without grip."""
         return free - (gripped.ravel() @ self._carried).reshape(-1, 3)
+
+    def moved(self, alone: FloatArray, force: FloatArray) -> FloatArray:
+        """Return the motion of the nodes (k, 3), mm, under forces (k, 3), mN, from that without them."""
+        return alone + (self._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
 
     def holding(self, gripped: FloatArray, force: FloatArray) -> FloatArray:
         """Return what holds the gripped nodes (g, 3), mN, from their motion (g, 3) without grip and the forces on the others (k, 3)."""
@@ -222,6 +245,8 @@ class _Search:
             if body._changed is None or useless:
                 if self._consistent(at, ENOUGH):
                     return at, True
+                if changes and body.tangent.pairs.n_pairs:
+                    return (yield from self._downhill(best, DOWNHILL * most))
                 if changes == most or cut_short > far or (changes and time.thread_time() > self.until):
                     break
                 yield
@@ -242,9 +267,60 @@ class _Search:
                 best = at
         return best, False
 
+    def _downhill(self, at: _Motion, most: int) -> Generator[None, None, tuple[_Motion, bool]]:
+        """Return the best that steps of Newton's method find from a motion, with at most so many matrices, and whether it is a balance.
+
+        Hundreds of pairs that open and close at once let such steps go much too far. The energy of pairs without friction is convex: along
+        every step, the forces that are left do work until it is least, and there the step ends. They are left of the forces under which a
+        motion is ``y = free + W f``, which a whole step determines.
+        """
+        law, nodes, best, exerted = self.law, len(self.body.nodes), at, None
+        law(at.motion)
+        for _ in range(most):
+            if time.thread_time() > self.until:
+                break
+            yield
+            change = law.change().with_springs(self._springs)
+            self.body._changed = changed = ChangedInverse.of(self.body._inverse, change)
+            step = -changed.solve(at.left)
+            resisted = change.times(step)
+            share = min(1.0, self.longest_mm / max(float(np.abs(step[:nodes]).max(initial=0.0)), 1e-300))
+            if exerted is None:
+                if share < 1.0:
+                    break
+                exerted = at.force - resisted
+            else:
+                further = at.force - exerted - resisted
+                share = self._least(at.motion, exerted, step, further, share)
+                exerted = exerted + share * further
+            at = self._tried(at.motion + share * step)
+            best = at if at.size < best.size else best
+            if at.size <= 10.0 * self.tolerance_mm and self._consistent(at, ENOUGH):
+                return at, True
+        return best, False
+
+    def _least(self, motion: FloatArray, exerted: FloatArray, step: FloatArray, further: FloatArray, most: float) -> float:
+        """Return the share of a step, and of the change of forces along it, at which the forces that are left do nearly no work on it."""
+
+        def work(share: float) -> float:
+            left = exerted + share * further - self._forces(motion + share * step)
+            return float((left * step).sum())
+
+        low, high, first = 0.0, most, work(0.0)
+        at_low, at_high = first, work(most)
+        for _ in range(SEARCHED):
+            if abs(at_high) <= LEFT * abs(first) or at_high < 0.0:
+                break
+            share = low + (high - low) * min(max(at_low / (at_low - at_high), 0.1), 0.9)
+            now = work(share)
+            if abs(now) <= LEFT * abs(first):
+                return share
+            low, at_low, high, at_high = (share, now, high, at_high) if now < 0.0 else (low, at_low, share, now)
+        return high
+
     def _tried(self, motion: FloatArray) -> _Motion:
         force = self._forces(motion)
-        left = motion - self.free - (self.body._inverse @ force.ravel().astype(np.float32)).reshape(-1, 3)
+        left = motion - self.body.moved(self.free, force)
         return _Motion(motion, force, left, float(np.abs(left).max(initial=0.0)))
 
     def _forces(self, motion: FloatArray) -> FloatArray:
@@ -298,6 +374,8 @@ class ContactBesideTangent:
         Of the surface.
     tangent : EarlierTangent
         With its contacts.
+    sides : ApproachingLips, optional
+        Pairs of the sides of cuts whose approach is condensed, in rows of three behind the nodes.
     """
 
     nodes: IntArray
@@ -306,6 +384,7 @@ class ContactBesideTangent:
     places: Sequence[Int32Array]
     pattern: BlockPattern
     tangent: EarlierTangent
+    sides: ApproachingLips | None = None
     exerted: float = field(init=False, default=0.0)
     _place: IntArray = field(init=False)
 
@@ -316,6 +395,7 @@ class ContactBesideTangent:
     def __call__(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
         moved, force = self.displacement.copy(), np.zeros_like(self.displacement)
+        motion, behind = motion[: len(self.nodes)], motion[len(self.nodes) :]
         moved[self.nodes] += motion
         pattern = self.pattern
         add_earlier_forces(pattern.indptr, pattern.indices, self.tangent.contact, self.nodes, self._place, motion, force)
@@ -324,18 +404,23 @@ class ContactBesideTangent:
             contact.add_force(moved, own if isinstance(contact, NearbyContact) else force)
         sides = sum(contact.exerted for contact in self.contacts if isinstance(contact, LipsBesideTangent))
         self.exerted = float(np.abs(own).sum()) + sides
-        return np.asarray((force + own)[self.nodes])
+        if self.sides is None:
+            return np.asarray((force + own)[self.nodes])
+        across = in_threes(self.sides.forces(behind.ravel()[: len(self.sides.gap)]))
+        self.exerted += self.sides.exerted
+        return np.concatenate([(force + own)[self.nodes], across])
 
     def change(self) -> BlockChange:
         """Return the stiffness at the last motion; see `ContactLaw`."""
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
         for contact, places in zip(self.contacts, self.places, strict=True):
             contact.touching().add_secant_stiffness(self.pattern, places, blocks)
-        return self._beside(blocks)
+        return self._beside(blocks, self.sides.change() if self.sides else None)
 
     def opened(self) -> BlockChange:
         """Return minus the stiffness of the contacts that the tangent contains; see `ContactLaw`."""
-        return self._beside(np.zeros((self.pattern.n_blocks, 3, 3)))
+        return self._beside(np.zeros((self.pattern.n_blocks, 3, 3)), self.sides.opened() if self.sides else None)
 
-    def _beside(self, blocks: FloatArray) -> BlockChange:
-        return contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place)
+    def _beside(self, blocks: FloatArray, across: FloatArray | None) -> BlockChange:
+        change = contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place)
+        return change if across is None else change.and_also(change_in_threes(across, len(self.nodes)))

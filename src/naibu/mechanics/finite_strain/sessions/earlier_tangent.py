@@ -14,6 +14,7 @@ from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.cores import usable_cores
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library, use_threads
+from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
 
@@ -44,6 +45,8 @@ class EarlierTangent:
         Of the nodes in that state, mm.
     seconds : float
         Of a processor that it took to make.
+    pairs : PairedMotion
+        Pairs of the sides of cuts without friction, along their normals of then, that may open or close.
     """
 
     factors: UpdatedFactors
@@ -55,6 +58,7 @@ class EarlierTangent:
     solver: LinearSolver
     displacement: FloatArray
     seconds: float = 0.0
+    pairs: PairedMotion = field(default_factory=PairedMotion.none)
 
 
 @dataclass(slots=True, eq=False)

@@ -1,10 +1,12 @@
 """Pairs of the two sides of cuts that open, close, stick or slip in a step, beside their stiffness in the tangent of an earlier state.
 
 A tangent of then holds closed what was closed then. Pairs whose state has changed since, or may change, are taken out of it, and their
-contact is solved as it is, condensed to their nodes like that of indenters (`naibu.mechanics.finite_strain.sessions.condensed_contact`).
-Friction has the stiffness of its secant in both; in the tangent, which is symmetric, without its growth with pressure. Where it acts, all
-pairs that press or are near to it are taken out: what the others leave out of balance where the motion turns round takes iterations of the
-whole body, and at last Newton's method.
+contact is solved as it is, condensed like that of indenters (`naibu.mechanics.finite_strain.sessions.condensed_contact`). Without friction
+only the approach of the two sides of a pair counts, so that all pairs that are near to each other take part: where a piece comes loose, as
+behind cuts that cross, hundreds hover between open and closed, and steps that hold most of them in their state of before find no balance.
+Friction is condensed to the nodes of the pairs, and has the stiffness of its secant in both; in the tangent, which is symmetric, without
+its growth with pressure. Where it acts, all pairs that press or are near to it are taken out: what the others leave out of balance where
+the motion turns round takes iterations of the whole body, and at last Newton's method.
 """
 
 from __future__ import annotations
@@ -13,15 +15,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.mechanics.contact._cut_lip_kernels import pair_forces
-from naibu.mechanics.contact.cut_lips import CutLips
+from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact._cut_lip_kernels import RAMP, pair_forces
+from naibu.mechanics.contact.cut_lips import CutLips, across
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
+from naibu.mechanics.linear_algebra.paired_motion import PairedMotion, forces_along, relative
+from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
 
-MOST = 80  # pairs in a step, without friction
-AHEAD = 40  # pairs for which the inverse is prepared, likewise
+MOST = 80  # pairs in a step whose nodes are condensed, without friction
+AHEAD = 900  # pairs whose approach is condensed, at most
 NEAR = 0.1  # of the edge: gaps, and penetrations, from which pairs are not expected to change
+NEARING = 0.3  # of the edge: gaps from which pairs are not expected to close before there is another tangent
+UNCHANGED = 5e-4  # of the largest change of the stiffness of a pair: what is left out
+TURNED = 0.9  # cosine of the angle by which the normal of a pair may have turned since a tangent was made
 
 
 @dataclass(slots=True, eq=False)
@@ -112,6 +119,8 @@ def changing_lips(lips: CutLips, tangent: EarlierTangent, displacement: FloatArr
     then = tangent.lips.any(axis=(1, 2))
     known = tangent.factors.covered(lips.pairs).all(axis=1)
     changed = (then != (before < 0.0)) | (known & (then != (after < 0.0)))
+    of_approach = approaching(lips, tangent)
+    known[of_approach] = changed[of_approach] = False
     close = np.minimum(np.abs(before), np.abs(after)) / lips.edge
     if lips.friction > 0.0:
         chosen = np.flatnonzero(changed | then | (close < NEAR)).astype(np.int64)
@@ -122,7 +131,137 @@ def changing_lips(lips: CutLips, tangent: EarlierTangent, displacement: FloatArr
 
 
 def lips_about_to_change(lips: CutLips, displacement: FloatArray) -> IntArray:
-    """Return the nodes (k,) of the pairs whose sides are nearest to opening or closing at a displacement (n, 3), mm, the nearest first."""
+    """Return the nodes (k,) of pairs that rub, and are near to each other at a displacement (n, 3), mm, the nearest first.
+
+    Without friction they need not be prepared: see `pairs_along_normals`.
+    """
+    if lips.friction == 0.0:
+        return np.zeros(0, dtype=np.int64)
     near = np.abs(lips.gaps(displacement)) / lips.edge
-    order = np.argsort(near, kind="stable")[: AHEAD if lips.friction == 0.0 else None]
+    order = np.argsort(near, kind="stable")
     return np.asarray(lips.pairs[order[near[order] < NEAR]].ravel(), dtype=np.int64)
+
+
+def pairs_along_normals(lips: CutLips, factors: UpdatedFactors, displacement: FloatArray, held: IntArray) -> PairedMotion:
+    """Return how the pairs that may open or close approach each other, by the factors of the tangent at a displacement (n, 3), mm.
+
+    Nodes that are held (h,) do not move in it.
+    """
+    gap, normal = lips.gaps_and_normals(displacement)
+    near = np.abs(gap) / lips.edge
+    order = np.argsort(near, kind="stable")[:AHEAD]
+    chosen = np.sort(order[near[order] < NEARING]).astype(np.int64)
+    return PairedMotion.of(factors, chosen, lips.pairs[chosen], normal[chosen], held)
+
+
+def approaching(lips: CutLips, tangent: EarlierTangent) -> IntArray:
+    """Return the pairs (k,) whose approach is condensed: those that a tangent knows, and that have not turned by much since then."""
+    known = tangent.pairs
+    now = lips.normals
+    assert now is not None
+    turned = (now[known.numbers] * known.directions).sum(axis=1)
+    return known.numbers[(turned > TURNED) | ~now[known.numbers].any(axis=1)]
+
+
+@dataclass(slots=True, eq=False)
+class ApproachingLips:
+    """Forces across pairs beside those that an earlier tangent contains, at their approach along their normals.
+
+    A tangent holds pairs along their normals of then, and how they move one another is known along these. That the normals have turned
+    meanwhile changes the gap by as much as the sides slide, which hardly depends on what presses across them.
+
+    Attributes
+    ----------
+    lips : CutLips
+        The pairs that a tangent knows, in its order, with the normals of the step.
+    active : ndarray, shape (p,), bool
+        Which of them take part.
+    normals, directions : ndarray, shape (p, 3)
+        Normals now, and those of the tangent; zero where a pair takes no part.
+    gap : ndarray, shape (p,)
+        Where they are, mm; negative where they press.
+    earlier : ndarray, shape (p,)
+        Their stiffness in the tangent, mN/mm.
+    """
+
+    lips: CutLips
+    active: BoolArray
+    normals: FloatArray
+    directions: FloatArray
+    gap: FloatArray
+    earlier: FloatArray
+    exerted: float = field(init=False, default=0.0)
+    _at: FloatArray = field(init=False)
+    _turned: FloatArray = field(init=False)  # what gaps change by as normals have turned, mm
+    _before: FloatArray = field(init=False)
+
+    @classmethod
+    def of(cls, lips: CutLips, tangent: EarlierTangent, displacement: FloatArray) -> ApproachingLips:
+        """Return the pairs of a tangent at a displacement (n, 3), mm."""
+        known = tangent.pairs
+        own = lips.only(known.numbers)
+        earlier = np.einsum("pi,pij,pj->p", known.directions, tangent.lips[known.numbers], known.directions)
+        active = np.isin(known.numbers, approaching(lips, tangent))
+        assert own.normals is not None
+        along = np.where(own.normals.any(axis=1)[:, None], own.normals, known.directions)
+        now, then = (np.where(active[:, None], unit, 0.0) for unit in (along, known.directions))
+        return cls(own, active, now, then, own.gaps(displacement), earlier)
+
+    def __post_init__(self) -> None:
+        self._at, self._turned = np.zeros(len(self.gap)), np.zeros(len(self.gap))
+        self._before = self._across(self.gap)
+
+    def motion(self, displacement: FloatArray) -> FloatArray:
+        """Return by how much the sides of each pair go apart along the normals of the tangent (p,), mm, from displacements (n, 3), mm."""
+        return relative(displacement.ravel(), self.lips.pairs, self.directions)
+
+    def slide(self, displacement: FloatArray) -> None:
+        """Have the sides slide as nodes are displaced (n, 3), mm."""
+        self._turned = relative(displacement.ravel(), self.lips.pairs, self.normals - self.directions)
+
+    def forces(self, apart: FloatArray) -> FloatArray:
+        """Return the forces (p,), mN, that part the sides, where they have gone apart (p,), mm, less those that the tangent has."""
+        self._at = self.gap + self._turned + apart
+        pressing = self._across(self._at)
+        self.exerted = 2.0 * float(pressing @ np.abs(self.normals).sum(axis=1))
+        return np.asarray(np.where(self.active, pressing - self._before + self.earlier * apart, 0.0))
+
+    def on_nodes(self, amounts: FloatArray, apart: FloatArray, held: IntArray, n_points: int) -> FloatArray:
+        """Return the forces (3 n,), mN, on the nodes of the body, of which some (h,) are held, of those on pairs.
+
+        Both the forces of pairs and their motion, mm, are in rows of three.
+        """
+        many = len(self.gap)
+        of_tangent = np.where(self.active, self.earlier * apart.ravel()[:many], 0.0)
+        force = forces_along(of_tangent, self.lips.pairs, self.directions, n_points)
+        force += forces_along(amounts.ravel()[:many] - of_tangent, self.lips.pairs, self.normals, n_points)
+        force.reshape(-1, 3)[held] = 0.0
+        return force
+
+    def change(self) -> FloatArray:
+        """Return the stiffness (p,), mN/mm, at the last forces, less that of the tangent."""
+        ramp = RAMP * self.lips.edge
+        slope = np.clip(-np.minimum(self._at, 0.0) / ramp, 0.0, 1.0) * self.lips.stiffness * self.lips.area
+        return np.asarray(np.where(self.active, slope - self.earlier, 0.0))
+
+    def opened(self) -> FloatArray:
+        """Return what `change` would be if no pair touched."""
+        return np.where(self.active, -self.earlier, 0.0)
+
+    def _across(self, gap: FloatArray) -> FloatArray:
+        return across(gap, self.lips.area, self.lips.edge, self.lips.stiffness)
+
+
+def in_threes(amounts: FloatArray) -> FloatArray:
+    """Return amounts (p,) as rows of three (ceil(p / 3), 3), as those of nodes; zeros behind the last."""
+    out = np.zeros((-(-len(amounts) // 3), 3))
+    out.ravel()[: len(amounts)] = amounts
+    return out
+
+
+def change_in_threes(change: FloatArray, first: int) -> BlockChange:
+    """Return the change of stiffnesses (p,), mN/mm, as that of rows of three, of which row `first` is the first one."""
+    rows = in_threes(change)
+    some = np.flatnonzero((np.abs(rows) > UNCHANGED * np.abs(rows).max(initial=0.0)).any(axis=1))
+    places = np.arange(len(some))
+    return BlockChange(first + some, places, places, rows[some][:, :, None] * np.eye(3))

@@ -14,7 +14,9 @@ from naibu.mechanics.finite_strain.lip_assembly import LipMultipliers, lips_of, 
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import pairs_along_normals
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
+from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
 FAINT = 1e-5  # strain of the body under contact forces too small to be told from none
@@ -104,4 +106,6 @@ def tangent_at(
     touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
     lips = np.concatenate([np.zeros((0, 3, 3)), *(some.add(u, np.zeros_like(u), secant=True)[1] for some in lips_of(assembler))])
     dilatation = engine._elements.dilatation(u)[1]
-    return EarlierTangent(factors, dilatation, contact, held, touched, lips, solver, u, time.thread_time() - began)
+    sides = [pairs_along_normals(some, factors, u, held) for some in lips_of(assembler) if some.friction == 0.0]
+    pairs = sides[0] if sides else PairedMotion.none()
+    return EarlierTangent(factors, dilatation, contact, held, touched, lips, solver, u, time.thread_time() - began, pairs)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.mechanics.contact.indenter_motion import harmless_ways, parts_of_approach, slow_enough
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
@@ -27,7 +27,7 @@ from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, UN
 from naibu.mechanics.finite_strain.sessions.divided_session import DividedSession
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import changing_lips
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, changing_lips, in_threes
 from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel
 from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
 from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, Trial
@@ -339,14 +339,15 @@ class RealTimeSession(DividedSession):
         gripped = np.concatenate([*self.bodies[1:], np.zeros(0, np.int64)])
         marked[gripped] = marked[tangent.held] = False
         nodes = np.flatnonzero(marked).astype(np.int64)
-        if len(nodes) or len(gripped):
+        sides = self._approaching(tangent, trial.displacement)
+        if len(nodes) or len(gripped) or sides is not None:
             condensed = self._condensed
             if condensed is None or not condensed.serves(tangent, nodes, gripped):
                 yield from tangent.factors.prepared(np.concatenate([nodes, gripped]))
-                condensed = self._condensed = CondensedContact(tangent, nodes, self._engine._local_stiffness[nodes], gripped)
+                condensed = self._condensed = CondensedContact(tangent, nodes, self._stiffness_at(nodes, tangent), gripped)
             nodes = condensed.nodes
             places = [*self._places, *([self._engine._pairs] if lips else [])]
-            law = ContactBesideTangent(nodes, trial.displacement, [*active, *lips], places, self._engine._surface, tangent)
+            law = ContactBesideTangent(nodes, trial.displacement, [*active, *lips], places, self._engine._surface, tangent, sides)
             begin = np.zeros_like(free)  # but nodes that indenters touch are carried along by them
             for near, gaps in zip(self._near if first else (), self._gaps, strict=False):
                 carried = near.contact.nodes[gaps[near.points] < 0.0]
@@ -355,12 +356,29 @@ class RealTimeSession(DividedSession):
             extent, faint = self.engine._extent, self._engine.faint_mn
             longest = min(0.05 * extent, float(harmless_ways(self.indenters).min(initial=np.inf)))
             limits = (RUBBING, RUBBING) if self.engine.assembler.unsymmetric else (CHANGES, UNAIDED)
-            alone = condensed.held(free[nodes], free[gripped])
-            force = yield from condensed.forces(alone, law, begin[nodes], 1e-5 * extent, longest, faint, *limits, self._patience)
+            still, begins = (np.concatenate([motion[nodes], *_of_sides(sides, motion)]) for motion in (free, begin))
+            alone = condensed.held(still, free[gripped])
+            if sides is not None:
+                sides.slide(free)
+            force = yield from condensed.forces(alone, law, begins, 1e-5 * extent, longest, faint, *limits, self._patience)
             holding = condensed.holding(free[gripped], force)
-            tangent.factors.add_columns(np.concatenate([nodes, gripped]), np.concatenate([force, holding]), x)
+            behind = len(nodes)
+            tangent.factors.add_columns(np.concatenate([nodes, gripped]), np.concatenate([force[:behind], holding]), x)
+            if sides is not None:
+                apart = condensed.moved(alone, force)[behind:]
+                x += tangent.factors.solve(sides.on_nodes(force[behind:], apart, tangent.held, len(free)))
         free[self._constrained] = 0.0
         return free
+
+    def _approaching(self, tangent: EarlierTangent, displacement: FloatArray) -> ApproachingLips | None:
+        """Return the pairs of the sides of cuts whose approach a tangent knows, at a displacement (n, 3), mm."""
+        known = tangent.pairs.n_pairs > 0
+        return ApproachingLips.of(lips_of(self._elements.assembler)[0], tangent, displacement) if known else None
+
+    def _stiffness_at(self, nodes: IntArray, tangent: EarlierTangent) -> FloatArray:
+        """Return the stiffness of the elements at nodes (k,) and, in rows of three, at the pairs of a tangent, mN/mm."""
+        local = self._engine._local_stiffness
+        return np.concatenate([local[nodes], in_threes(local[tangent.pairs.nodes].mean(axis=1)).max(axis=1)])
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
@@ -387,3 +405,8 @@ class RealTimeSession(DividedSession):
 
     def _exerted(self, trial: Trial) -> FloatArray:
         return np.array([(trial.balance - trial.contact)[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3)
+
+
+def _of_sides(sides: ApproachingLips | None, motion: FloatArray) -> list[FloatArray]:
+    """Return by how much pairs go apart as nodes move (n, 3), mm, in rows of three; nothing where there are no pairs."""
+    return [] if sides is None else [in_threes(sides.motion(motion))]
