@@ -62,6 +62,10 @@ class NearbyContact:
         """Return the points that are marked (p,)."""
         return self if which.all() else NearbyContact(at_points(self.contact, which), self.anchors[which], self.points[which])
 
+    def numbered(self, place: IntArray) -> NearbyContact:
+        """Return these points of nodes that are numbered anew: `place` (n,) has the new number of each."""
+        return NearbyContact(replace(self.contact, nodes=place[self.contact.nodes]), self.anchors, self.points)
+
     @classmethod
     def of(cls, contact: Contact, anchors: FloatArray, gap: FloatArray, margin_mm: float) -> NearbyContact:
         """Return the points whose gaps (p,) are below a margin, mm."""

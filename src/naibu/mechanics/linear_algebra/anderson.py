@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray
 
 
@@ -32,9 +33,32 @@ class AndersonMixing:
         """Return the step (n,) to take from x (n,), where the iteration itself would step by d (n,)."""
         mixed = d
         if self._x:
-            dx = np.stack([x - other for other in self._x])
-            dd = np.stack([d - other for other in self._d])
-            weights = np.linalg.lstsq(dd @ dd.T, dd @ d, rcond=1e-10)[0]
-            mixed = d - weights @ (dx + dd)
+            mixed = np.empty_like(d)
+            _mix(np.array(self._x), np.array(self._d), x, d, mixed)
         self._x, self._d = [*self._x, x][-self.depth :], [*self._d, d][-self.depth :]
         return np.asarray(mixed)
+
+
+@njit(cache=True, nogil=True, fastmath={"contract", "reassoc"})
+def _mix(earlier_x, earlier_d, x, d, mixed):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Put d less the mean of the differences from earlier steps, and from where they began, whose weights leave least of d, in place."""
+    count, n = earlier_x.shape
+    change, products, right = np.empty((count, n)), np.empty((count, count)), np.empty(count)
+    for a in range(count):
+        for i in range(n):
+            change[a, i] = d[i] - earlier_d[a, i]
+    for a in range(count):
+        for b in range(a + 1):
+            total = 0.0
+            for i in range(n):
+                total += change[a, i] * change[b, i]
+            products[a, b] = products[b, a] = total
+        total = 0.0
+        for i in range(n):
+            total += change[a, i] * d[i]
+        right[a] = total
+    weights = np.linalg.lstsq(products, right, 1e-10)[0]
+    mixed[:] = d
+    for a in range(count):
+        for i in range(n):
+            mixed[i] -= weights[a] * (x[i] - earlier_x[a, i] + change[a, i])

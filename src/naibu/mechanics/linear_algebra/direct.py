@@ -70,7 +70,7 @@ MKL_MB = 400  # of address space for the libraries, twice of what they took here
 MKL_THREAD_MB = 80  # for the stack and the heap of a thread
 SINGULAR = {np.float64: 1e14, np.float32: 1e9}  # growth of a solution, beyond which it is rounding
 _NO_MEMORY = -2  # PARDISO's number of this error
-_BY_COLUMNS, _IN_SEQUENCE = 0, 1  # how threads share a solution, its parameter 24: the right sides among them, or not at all
+_BY_COLUMNS, IN_SEQUENCE = 0, 1  # how threads share a solution, its parameter 24: the right sides among them, or not at all
 
 
 class PardisoSolver:
@@ -148,19 +148,31 @@ class PardisoSolver:
             self._release()
         if not self._threads:
             self._analyse(threads)
-        error = self._call(22, *self._nothing())
+        error = self._factorized()
         if error == -4 and self._type == 2:  # not positive definite: use the indefinite factorization
             self._release()
             self._type = -2
             self._analyse(threads)
-            error = self._call(22, *self._nothing())
+            error = self._factorized()
         perturbed = int(self._parameters[13])  # vanishing pivots, which PARDISO silently replaces by tiny ones
         if error != 0 or perturbed:
             what = f"PARDISO error {error}, {perturbed} vanishing pivots"
             raise ConvergenceError(f"the linear system is singular ({what}): are all rigid-body motions constrained?")
-        if self._type != 2:  # a Cholesky factorization has seen that all pivots are positive, however badly the matrix is scaled
+        if not self._definite():  # where all pivots are positive, it is regular, however badly it is scaled
             self._require_regular()
         return self
+
+    def _factorized(self) -> int:
+        """Factorize the values; returns PARDISO's number of the error, or 0."""
+        return self._call(22, *self._nothing())
+
+    def _definite(self) -> bool:
+        """Whether the factorization has seen that all pivots are positive: Cholesky's does."""
+        return self._type == 2
+
+    def _permutation(self) -> ctypes.c_void_p | None:
+        """Return what PARDISO takes for a permutation: none, it orders the unknowns itself."""
+        return None
 
     def _require_regular(self) -> None:
         """Refuse a matrix whose solutions grow beyond rounding: which pivots count as vanishing depends on the processor.
@@ -181,7 +193,7 @@ class PardisoSolver:
         """Return x for b of shape (n,) or (n, r)."""
         columns = 1 if b.ndim == 1 else b.shape[1]
         # on several threads one column would be solved with contributions added in the order in which threads happen to finish them
-        self._parameters[24] = _IN_SEQUENCE if columns == 1 else _BY_COLUMNS
+        self._parameters[24] = IN_SEQUENCE if columns == 1 else _BY_COLUMNS
         rhs: AnyFloatArray = np.asarray(b, dtype=self._float, order="F")
         x: AnyFloatArray = np.zeros(rhs.shape, dtype=self._float, order="F")
         error = self._call(33, rhs, x, columns)
@@ -199,7 +211,7 @@ class PardisoSolver:
         error = ctypes.c_int32(0)
         self._library.pardiso(
             pointer(self._handle), integer(1), integer(1), integer(self._type), integer(phase), integer(self._n),
-            pointer(self._values), pointer(self._ia), pointer(self._ja), None, integer(columns), pointer(self._parameters),
+            pointer(self._values), pointer(self._ia), pointer(self._ja), self._permutation(), integer(columns), pointer(self._parameters),
             integer(0), pointer(b), pointer(x), ctypes.byref(error),
         )  # fmt: skip
         if error.value == _NO_MEMORY:

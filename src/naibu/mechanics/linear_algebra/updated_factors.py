@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from naibu._numba.compilation import njit
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.mechanics.linear_algebra.protocols import Factorization
+from naibu.mechanics.linear_algebra.schur_complement import PardisoSchurSolver
 
 COLUMNS = 96  # of the inverse that are computed at once
 FEW = 8  # nodes that are prepared at once where one waits for them
@@ -68,7 +69,7 @@ class UpdatedFactors:
     Attributes
     ----------
     factors : Factorization
-        Of A (3 n, 3 n).
+        Of A (3 n, 3 n); A is symmetric where they are those of a `PardisoSchurSolver`, whose part of the inverse is known without columns.
     n_points : int
         Number n of nodes.
     """
@@ -77,13 +78,15 @@ class UpdatedFactors:
     n_points: int
     _nodes: IntArray = field(init=False)
     _slot: IntArray = field(init=False)
-    _columns: list[NDArray[np.float32]] = field(init=False, default_factory=list)
+    _columns: list[NDArray[np.float32]] = field(init=False, default_factory=list)  # of the inverse, of nodes behind those of the factors
     _inverse: NDArray[np.float32] = field(init=False)
 
     def __post_init__(self) -> None:
-        self._nodes = np.zeros(0, dtype=np.int64)
         self._slot = np.full(self.n_points, -1, dtype=np.int64)
-        self._inverse = np.zeros((0, 0), dtype=np.float32)
+        self._nodes, self._inverse = np.zeros(0, dtype=np.int64), np.zeros((0, 0), dtype=np.float32)
+        if isinstance(self.factors, PardisoSchurSolver):
+            self._nodes, self._inverse = self.factors.nodes, np.asarray(self.factors.inverse, dtype=np.float32)
+            self._slot[self._nodes] = np.arange(len(self._nodes))
 
     def covered(self, nodes: IntArray) -> BoolArray:
         """For which of these nodes (any shape) the part of the inverse is known."""
@@ -116,9 +119,14 @@ class UpdatedFactors:
 
     def _gather(self) -> None:
         """Take the part between the nodes out of the columns; it is of the order of its square, and not done after every few nodes."""
-        if len(self._inverse) < 3 * len(self._nodes):
-            at = _rows(self._nodes)
-            self._inverse = np.concatenate([part.T.take(at, axis=1) for part in self._columns]).T
+        if len(self._inverse) == 3 * len(self._nodes):
+            return
+        of_factors = 3 * len(self._nodes) - sum(columns.shape[1] for columns in self._columns)
+        at, whole = _rows(self._nodes), np.empty((3 * len(self._nodes),) * 2, dtype=np.float32, order="F")
+        whole[:of_factors, :of_factors] = self._inverse[:of_factors, :of_factors]
+        whole[:, of_factors:] = np.concatenate([part.T.take(at, axis=1) for part in self._columns]).T
+        whole[of_factors:, :of_factors] = whole[:of_factors, of_factors:].T
+        self._inverse = whole
 
     def prepared(self, nodes: IntArray) -> Iterator[None]:
         """Prepare a few nodes of (k,) at a time, and yield between them, until all are known: one may go on later."""
@@ -150,7 +158,12 @@ class UpdatedFactors:
 
     def add_columns(self, nodes: IntArray, amounts: FloatArray, x: FloatArray) -> None:
         """Add the columns of the inverse that belong to nodes (k,), times amounts (k, 3), to x (3 n,)."""
-        slots, first = self._slot[nodes], 0
+        slots = self._slot[nodes]
+        first = len(self._nodes) - sum(columns.shape[1] for columns in self._columns) // 3
+        if isinstance(self.factors, PardisoSchurSolver) and amounts[slots < first].any():
+            condensed = np.zeros((first, 3))
+            condensed[slots[slots < first]] = amounts[slots < first]
+            x += self.factors.solve_condensed(condensed)
         for columns in self._columns:
             count = columns.shape[1] // 3
             here = (slots >= first) & (slots < first + count)
@@ -203,10 +216,13 @@ class ChangedInverse:
         both = np.flatnonzero(partner >= 0)
         right = b[nodes]
         right[both] -= b[partner[both]]
-        there = la.lu_solve(self._factors, right.astype(np.float32).ravel(), check_finite=False).astype(np.float64).reshape(-1, 3)
-        reaction = np.zeros((len(nodes), 3))
-        np.add.at(reaction, self.change.rows, np.einsum("bij,bj->bi", self.change.blocks, there[self.change.columns]))
-        out = b - (self._columns @ reaction.ravel().astype(np.float32)).reshape(-1, 3)
+        there = la.lapack.sgetrs(*self._factors, right.astype(np.float32).ravel())[0].reshape(-1, 3)
+        reaction = np.zeros((len(nodes), 3), dtype=np.float32)
+        _react(self.change.rows, self.change.columns, self.change.blocks, there, reaction)
+        out = b - (self._columns @ reaction.ravel()).reshape(-1, 3)
+        if len(both) == 0:
+            out[nodes] = there
+            return np.asarray(out)
         alone = partner < 0
         out[nodes[alone]] = there[alone]
         wrong = 0.5 * (there[both] - (out[nodes[both]] - out[partner[both]]))
@@ -258,6 +274,15 @@ def _partners(count, rows, columns, blocks):  # type: ignore[no-untyped-def]  # 
         if same:
             other[i] = j
     return other
+
+
+@njit(cache=True, nogil=True)
+def _react(rows, columns, blocks, motion, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the product of a matrix of blocks and a motion (k, 3) to `reaction` (k, 3)."""
+    for b in range(len(rows)):
+        r, c = rows[b], columns[b]
+        for i in range(3):
+            reaction[r, i] += blocks[b, i, 0] * motion[c, 0] + blocks[b, i, 1] * motion[c, 1] + blocks[b, i, 2] * motion[c, 2]
 
 
 @njit(cache=True, nogil=True, fastmath=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.rigid_transform import RigidTransform
 from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter, spherical_indenter
@@ -51,13 +51,14 @@ class Dragged:
     work: FloatArray  # of the ball so far, mN mm
     volume: float  # smallest det F
     closed: list[int]  # pairs of the sides that press
+    whole: BoolArray  # steps that were not taken in parts
     session: DynamicSession
 
 
 def dragged(kind: type[DynamicEngine]) -> Dragged:
     options = {"background": False} if kind is RealTimeEngine else {}
     engine = kind(CUT.points, MADE, MASS, boundary_faces(CUT).faces, step=STEP, **options)
-    force, balance, energy, work, volume, closed = [], [], [], [0.0], np.inf, []
+    force, balance, energy, work, volume, closed, whole = [], [], [], [0.0], np.inf, [], []
 
     def stored(state: DynamicState) -> float:
         return float(PLAIN.forces(state.displacement)[0]) + 0.5 * float((MASS * (state.velocity**2).sum(axis=1)).sum())
@@ -72,6 +73,7 @@ def dragged(kind: type[DynamicEngine]) -> Dragged:
             balance.append(forces.bodies[0, 0] + forces.indenters[0, 0] - momentum)
             work.append(work[-1] + STEP * float(force[-1] @ velocity))
             energy.append(stored(after))
+            whole.append(np.allclose(STEP * after.velocity, after.displacement - before.displacement, atol=1e-9))
             volume = min(volume, engine.assembler.forces(after.displacement)[2])
             closed.append(_require_coulomb(engine, before, after))
             if isinstance(session, RealTimeSession):
@@ -80,7 +82,7 @@ def dragged(kind: type[DynamicEngine]) -> Dragged:
                 told = session.unbalanced * (pressing + rubbing + engine.faint_mn)
                 assert np.abs(balance[-1]).sum() <= told + engine.faint_mn
     spent = np.array(work[1:]) - (np.array(energy) - stored(engine.rest()))
-    return Dragged(np.array(force), np.array(balance), spent, np.array(work[1:]), volume, closed, session)
+    return Dragged(np.array(force), np.array(balance), spent, np.array(work[1:]), volume, closed, np.array(whole), session)
 
 
 def _require_coulomb(engine: DynamicEngine, before: DynamicState, after: DynamicState) -> int:
@@ -133,7 +135,9 @@ def test_momentum_is_balanced_no_element_inverts_and_no_energy_comes_from_nothin
 def test_in_real_time_the_force_is_that_of_newtons_method_without_a_step_of_it(exact: Dragged, fast: Dragged) -> None:
     assert isinstance(fast.session, RealTimeSession) and fast.session.newton_steps == 0
     apart = np.linalg.norm(fast.force - exact.force, axis=1) / np.linalg.norm(exact.force, axis=1).max()
-    assert apart.max() < 0.1 and np.quantile(apart, 0.9) < 0.02  # most where the ball leaves, and little of the force is left
+    # most where the ball leaves, and little of the force is left; where Newton's method takes parts of a step, its force is their mean
+    assert apart[exact.whole].max() < 0.1 and np.quantile(apart, 0.9) < 0.02 and np.count_nonzero(~exact.whole) < 6
+    assert fast.whole.all()
     there, back = fast.force[12:42, 1], fast.force[42:72, 1]
     assert back[-1] < 0.0 < there[-1]  # it drags the body along
 

@@ -250,6 +250,7 @@ class _Search:
                 if changes == most or cut_short > far or (changes and time.thread_time() > self.until):
                     break
                 yield
+                law(at.motion)  # its last motion may be another
                 change = law.change().with_springs(self._springs)
                 body._changed, changes = ChangedInverse.of(body._inverse, change), changes + 1
                 begun, steps, mixing = at, 0, AndersonMixing(DEPTH)
@@ -260,7 +261,6 @@ class _Search:
             evaluations, steps = evaluations + 1, steps + 1
             if mixing.steps > 1 and at.size > JUMP * before.size:
                 at, mixing = before, AndersonMixing(DEPTH)
-                law(at.motion)
             slow = steps >= TRIAL and at.size > SLOW**steps * begun.size
             useless = slow or share < 1.0 or at.size > JUMP * begun.size
             if at.size < best.size:
@@ -275,11 +275,11 @@ class _Search:
         motion is ``y = free + W f``, which a whole step determines.
         """
         law, nodes, best, exerted = self.law, len(self.body.nodes), at, None
-        law(at.motion)
         for _ in range(most):
             if time.thread_time() > self.until:
                 break
             yield
+            law(at.motion)  # its last motion may be another
             change = law.change().with_springs(self._springs)
             self.body._changed = changed = ChangedInverse.of(self.body._inverse, change)
             step = -changed.solve(at.left)
@@ -321,20 +321,20 @@ class _Search:
     def _tried(self, motion: FloatArray) -> _Motion:
         force = self._forces(motion)
         left = motion - self.body.moved(self.free, force)
-        return _Motion(motion, force, left, float(np.abs(left).max(initial=0.0)))
+        return _Motion(motion, force, left, float(np.abs(left).max(initial=0.0)), self.law.exerted)
 
     def _forces(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3) of contacts, and of the springs that hold the nodes back, mN."""
         return np.asarray(self.law(motion) - self._springs[:, None] * (motion - self._begin))
 
     def _consistent(self, at: _Motion, fraction: float) -> bool:
-        """Whether the forces of a motion are, but for little, those of the motion that they lead to; the law is left where it was."""
-        apart = float(np.abs(self._forces(at.motion - at.left) - at.force).sum())
-        self.law(at.motion)
-        return apart <= fraction * (min(float(np.abs(at.force).sum()), self.law.exerted) + self.faint_mn)
+        """Whether the forces of a motion are, but for little, those of the motion that they lead to."""
+        if np.isnan(at.apart):
+            at.apart = float(np.abs(self._forces(at.motion - at.left) - at.force).sum())
+        return at.apart <= fraction * (min(float(np.abs(at.force).sum()), at.exerted) + self.faint_mn)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Motion:
     """A motion of the nodes concerned, mm.
 
@@ -348,12 +348,18 @@ class _Motion:
         y - free - W g(y), mm.
     size : float
         Its largest component.
+    exerted : float
+        See `ContactLaw`.
+    apart : float
+        Sum of the components by which the forces differ from those of the motion that they lead to, mN; NaN until it is asked for.
     """
 
     motion: FloatArray
     force: FloatArray
     left: FloatArray
     size: float
+    exerted: float
+    apart: float = np.nan
 
 
 @dataclass(slots=True, eq=False)
@@ -387,33 +393,45 @@ class ContactBesideTangent:
     sides: ApproachingLips | None = None
     exerted: float = field(init=False, default=0.0)
     _place: IntArray = field(init=False)
+    _there: FloatArray = field(init=False)  # displacements (l, 3) of the nodes and, behind them, of others of contacts, which do not move
+    _indenters: list[NearbyContact] = field(init=False)  # with points of nodes in this order
+    _lips: list[LipsBesideTangent] = field(init=False)
 
     def __post_init__(self) -> None:
         self._place = np.full(len(self.displacement), -1, dtype=np.int64)
         self._place[self.nodes] = np.arange(len(self.nodes))
+        own = [c.contact.nodes if isinstance(c, NearbyContact) else c.lips.pairs for c in self.contacts]
+        concerned = np.unique(np.concatenate([np.zeros(0, np.int64), *(nodes.ravel() for nodes in own)]))
+        order = np.concatenate([self.nodes, concerned[self._place[concerned] < 0]])
+        number = np.empty(len(self.displacement), dtype=np.int64)
+        number[order] = np.arange(len(order))
+        self._there = self.displacement[order]
+        self._indenters = [c.numbered(number) for c in self.contacts if isinstance(c, NearbyContact)]
+        self._lips = [c.numbered(number) for c in self.contacts if isinstance(c, LipsBesideTangent)]
 
     def __call__(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
-        moved, force = self.displacement.copy(), np.zeros_like(self.displacement)
-        motion, behind = motion[: len(self.nodes)], motion[len(self.nodes) :]
-        moved[self.nodes] += motion
+        count, moved, force, own = len(self.nodes), self._there.copy(), np.zeros_like(self._there), np.zeros_like(self._there)
+        motion, behind = motion[:count], motion[count:]
+        moved[:count] += motion
         pattern = self.pattern
         add_earlier_forces(pattern.indptr, pattern.indices, self.tangent.contact, self.nodes, self._place, motion, force)
-        own = np.zeros_like(force)
-        for contact in self.contacts:
-            contact.add_force(moved, own if isinstance(contact, NearbyContact) else force)
-        sides = sum(contact.exerted for contact in self.contacts if isinstance(contact, LipsBesideTangent))
-        self.exerted = float(np.abs(own).sum()) + sides
+        for contact in self._indenters:
+            contact.add_force(moved, own)
+        for lips in self._lips:
+            lips.add_force(moved, force)
+        self.exerted = float(np.abs(own).sum()) + sum(lips.exerted for lips in self._lips)
         if self.sides is None:
-            return np.asarray((force + own)[self.nodes])
+            return np.asarray((force + own)[:count])
         across = in_threes(self.sides.forces(behind.ravel()[: len(self.sides.gap)]))
         self.exerted += self.sides.exerted
-        return np.concatenate([(force + own)[self.nodes], across])
+        return np.concatenate([(force + own)[:count], across])
 
     def change(self) -> BlockChange:
         """Return the stiffness at the last motion; see `ContactLaw`."""
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
-        for contact, places in zip(self.contacts, self.places, strict=True):
+        numbered: list[NearbyContact | LipsBesideTangent] = [*self._indenters, *self._lips]
+        for contact, places in zip(numbered, self.places, strict=True):
             contact.touching().add_secant_stiffness(self.pattern, places, blocks)
         return self._beside(blocks, self.sides.change() if self.sides else None)
 

@@ -13,11 +13,13 @@ from naibu._numba.compilation import njit
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.cores import usable_cores
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
-from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library, use_threads
+from naibu.mechanics.linear_algebra.direct import SuperLUSolver, pardiso_library, use_threads
 from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
+from naibu.mechanics.linear_algebra.schur_complement import PardisoSchurSolver
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
 
+MORE = 160  # nodes beyond those that are asked for, which take less time than another analysis of the pattern
 THRESHOLD = 5e-4  # of the largest stiffness of the contact: change of a block that is taken into account
 
 
@@ -147,18 +149,33 @@ class SolverPool:
     pattern: BlockPattern
     _spare: list[LinearSolver] = field(init=False, default_factory=list)
 
-    def get(self) -> LinearSolver:
-        """Return a solver that may factorize."""
-        if self._spare:
-            return self._spare.pop()
+    def get(self, nodes: IntArray) -> LinearSolver:
+        """Return a solver that may factorize; where it can, it brings the part of the inverse between these nodes (k,), ascending.
+
+        One that knows the pattern with just these nodes, or not many more, is preferred: another has to analyse it.
+        """
+        serving = [s for s in self._spare if isinstance(s, PardisoSchurSolver) and _serves(s.nodes, nodes)]
+        for solver in [*sorted(serving, key=lambda s: len(s.nodes)), *self._spare]:
+            try:
+                self._spare.remove(solver)
+            except ValueError:  # another thread has just taken it
+                continue
+            if solver not in serving and isinstance(solver, PardisoSchurSolver):
+                solver.condense(nodes)
+            return solver
         if pardiso_library() is None:
             return SuperLUSolver()
-        empty = self.pattern.matrix(np.zeros((self.pattern.n_blocks, 3, 3)))
-        return PardisoSolver(empty, symmetric=True, single_precision=True)
+        made = PardisoSchurSolver(self.pattern.matrix(np.zeros((self.pattern.n_blocks, 3, 3))), single_precision=True)
+        made.condense(nodes)
+        return made
 
     def put(self, solver: LinearSolver) -> None:
         """Take back a solver."""
         self._spare.append(solver)
+
+
+def _serves(known: IntArray, nodes: IntArray) -> bool:
+    return len(known) <= len(nodes) + MORE and bool(np.isin(nodes, known, assume_unique=True).all())
 
 
 def contact_change(pattern: BlockPattern, blocks: FloatArray, tangent: EarlierTangent, nodes: IntArray, place: IntArray) -> BlockChange:
@@ -210,12 +227,12 @@ def _changed_blocks(indptr, indices, blocks, earlier, nodes, place, fraction):  
 
 @njit(cache=True, nogil=True)
 def add_earlier_forces(indptr, indices, blocks, nodes, place, motion, force):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the product of blocks between these nodes and their motion (k, 3) to `force` (n, 3)."""
+    """Add the product of blocks between these nodes and their motion (k, 3) to `force`, in their order."""
     for k in range(len(nodes)):
         for at in range(indptr[nodes[k]], indptr[nodes[k] + 1]):
             column = place[indices[at]]
             if column >= 0:
                 for i in range(3):
-                    force[nodes[k], i] += (
+                    force[k, i] += (
                         blocks[at, i, 0] * motion[column, 0] + blocks[at, i, 1] * motion[column, 1] + blocks[at, i, 2] * motion[column, 2]
                     )

@@ -11,6 +11,7 @@ the motion turns round takes iterations of the whole body, and at last Newton's 
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -56,6 +57,8 @@ class LipsBesideTangent:
     exerted: float = field(init=False, default=0.0)
     _now: FloatArray = field(init=False)
     _before: FloatArray = field(init=False)  # internal forces on the first nodes (k, 3), mN
+    _pairs: IntArray = field(init=False)  # their nodes as displacements number them
+    _start: FloatArray = field(init=False)  # displacements of the second nodes less those of the first (k, 3), mm
     _begun: FloatArray = field(init=False)  # positions of the second nodes relative to the first (k, 3), mm
     _anchors: FloatArray = field(init=False)
     _overlaps: FloatArray = field(init=False)
@@ -66,8 +69,15 @@ class LipsBesideTangent:
         at_rest = self.lips.points[second] - self.lips.points[first]
         self._anchors = at_rest if self.lips.anchors is None else self.lips.anchors
         self._overlaps = np.zeros(len(self.points)) if self.lips.overlaps is None else self.lips.overlaps
-        self._begun = at_rest + (self.displacement[second] - self.displacement[first])
+        self._pairs, self._start = self.lips.pairs, self.displacement[second] - self.displacement[first]
+        self._begun = at_rest + self._start
         self._evaluate(self._begun, self._before)
+
+    def numbered(self, place: IntArray) -> LipsBesideTangent:
+        """Return these pairs of nodes that are numbered anew: `place` (n,) has the new number of each."""
+        anew = copy(self)
+        anew._pairs = place[self.lips.pairs]
+        return anew
 
     def _evaluate(self, relative: FloatArray, force: FloatArray) -> None:
         own = self.lips
@@ -76,8 +86,8 @@ class LipsBesideTangent:
 
     def add_force(self, displacement: FloatArray, force: FloatArray) -> None:
         """Add the change of the forces up to a displacement (n, 3), mm, to `force` (n, 3), mN."""
-        first, second = self.lips.pairs.T
-        moved = displacement[second] - displacement[first] - (self.displacement[second] - self.displacement[first])
+        first, second = self._pairs.T
+        moved = displacement[second] - displacement[first] - self._start
         change = np.empty_like(self._before)
         self._evaluate(self._begun + moved, change)
         self.exerted = 2.0 * float(np.abs(change).sum())

@@ -100,7 +100,7 @@ def tangent_at(
     blocks[pattern.diagonal()] += (engine.mass / (duration or engine.step) ** 2)[:, None, None] * np.eye(3)
     fixed = np.zeros(engine.points.shape, dtype=bool)
     fixed[held] = True
-    solver = engine._solvers.get()
+    solver = engine._solvers.get(np.unique(ahead))
     factors = UpdatedFactors(solver.factorize(with_dirichlet_rows(pattern.matrix(blocks), fixed)), len(u))
     factors.prepare(ahead)
     touched = np.unique(engine._surface.indices[(contact != 0.0).any(axis=(1, 2))]).astype(np.int64)
