@@ -118,9 +118,9 @@ def _moved_back(at: Linearised, o: Observed, u: FloatArray) -> FloatArray:
     change = np.zeros_like(vectors)
     for found, sign in ((there, 1.0), (here, -1.0)):
         shape = (len(points), mesh.n_points)
-        change += sign * (sp.csr_matrix((found.weights.ravel(), (rows, mesh.cells[found.cells].ravel())), shape=shape) @ u)
+        change += sign * np.asarray(sp.csr_matrix((found.weights.ravel(), (rows, mesh.cells[found.cells].ravel())), shape=shape) @ u)
     change[there.distance_mm > 0.0] = 0.0
-    return np.einsum("nij,nj->ni", whitening(field, o.load_case.name)[0], change).ravel()
+    return np.asarray(np.einsum("nij,nj->ni", whitening(field, o.load_case.name)[0], change).ravel())
 
 
 def _misfit(at: Linearised, refit: Refit) -> float:
