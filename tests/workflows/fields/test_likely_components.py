@@ -10,14 +10,16 @@ import pytest
 
 from naibu.cli import main
 from naibu.core.displacement_field import DisplacementField
+from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.assumptions.component_order import LikelierOrder
+from naibu.identification.from_fields.assumptions.volume_change import VolumeChange
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody
 from naibu.workflows.fields.identify_fields import identify_fields
-from naibu.workflows.fields.likely_components import told_order
+from naibu.workflows.fields.likely_components import told_doubt, told_order
 
 SD_MM = 0.04
 SIDES = ("z-", "z+")
@@ -72,6 +74,33 @@ def test_right_fields_and_those_that_are_said_to_be_right_are_searched(
             folder / f"{name}.h5", zones=folder / "labels.mha", known=["label 2=10 kPa"], loaded=SIDES, each_cell=each_cell,
             progress=stop_at_search, **options,  # type: ignore[arg-type]
         )  # fmt: skip
+
+
+@pytest.mark.parametrize("each_cell", [False, True])
+def test_a_wrong_sign_is_named_as_well_where_forces_may_act_anywhere(folder: Path, *, each_cell: bool) -> None:
+    with pytest.raises(InputError, match="change the sign of uz, or else of ux and uy"):
+        identify_fields(
+            folder / "wrong.h5", zones=folder / "labels.mha", known=["label 2=10 kPa"], each_cell=each_cell, progress=stop_at_search
+        )
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("right", {}), ("wrong", {"check_components": False}), ("wrong", {"known": ["label 2=10 kPa, 0.1"]})],
+    ids=["right", "said to be right", "a sponge"],
+)
+def test_a_field_that_may_be_right_is_searched_where_forces_may_act_anywhere(folder: Path, name: str, options: dict[str, object]) -> None:
+    with pytest.raises(Searching):
+        identify_fields(
+            folder / f"{name}.h5", zones=folder / "labels.mha", progress=stop_at_search,
+            **{"known": ["label 2=10 kPa"], **options},  # type: ignore[arg-type]
+        )  # fmt: skip
+
+
+def test_another_order_of_what_may_be_a_sponge_is_a_doubt() -> None:
+    told = told_doubt(VolumeChange(0.71, 0.5, 0.12, 1, np.eye(3)[[2, 1, 0]]))
+    assert "changes 0.71 times as much as the shape" in told and "0.12 times" in told
+    assert "take uz, uy, ux for ux, uy, uz" in told
 
 
 def test_another_order_is_told_with_the_columns_to_take() -> None:

@@ -11,6 +11,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumed_law
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
+from naibu.identification.from_fields.assumptions.other_readings import judged_readings, other_readings
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
@@ -93,6 +94,7 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     unbiased = Objective(bounds=settings.bounds).clipped(found.size.theta - found.bias)
     theta = np.where(at_bounds > 0.0, found.size.theta, unbiased)
     by_elements = None if of_elements is None else replace(found.of_noise, covariance=of_elements).of_young_and_poisson(theta)[0]
+    judged = judged_readings(judged, other_readings(found.at, found.quadratic, found.shared * max(1.0, found.misfit / fit.freedom)))
     judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total)
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))

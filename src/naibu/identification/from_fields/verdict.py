@@ -46,7 +46,7 @@ def verdict(observed: Sequence[Observed], residuals: Sequence[FloatArray], degre
     unexplained = float(np.sqrt(left / max(deformed, 1e-300)))
     shared = shared_part([(o.points, r.reshape(len(o.points), -1)) for o, r in zip(observed, residuals, strict=True)]).correlation
     how = _explanation(factor, unexplained, shared, noise_stated=noise_stated)
-    noise = f"residuals are {factor:.2g} times the stated noise, " if noise_stated else ""
+    noise = f"residuals are {factor:.2g} times the noise, " if noise_stated else ""
     lead = f"{noise}{100 * unexplained:.2g} % of the deformation is left unexplained"
     reasons: tuple[str, ...] = ()
     if how is not Explanation.EXPLAINED:

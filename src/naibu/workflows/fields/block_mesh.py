@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 from scipy import ndimage
 
-from naibu.core.arrays import AnyArray, FloatArray, IntArray, require_lengths
+from naibu.core.arrays import AnyArray, BoolArray, FloatArray, IntArray, require_lengths
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
@@ -20,6 +20,7 @@ from naibu.meshing.surface import boundary_faces
 
 CELLS = 1200  # by default
 BLURRED = 0.01  # part of the object that cubes may misrepresent without a word
+OF_ZONE = 0.02  # the same of a zone: small ones are a small part of the object, and their moduli err by about as much as their cubes
 MOST_CELLS = 100_000  # of a mesh whose size is asked for: beyond, a factorization does not fit into memory
 MOST_LABEL = 65535
 BEYOND = "beyond the object"  # region of cells around it, which help to fit others to its surface and are then removed
@@ -262,7 +263,7 @@ def mesh_that_shows(
     size = element_size_mm
     while True:
         mesh, cells = block_mesh(inside, labels, names, size)
-        lost = _lost(mesh, cells, inside, labels, names, sought)
+        lost = _lost(mesh, cells, inside.values != 0, labels, names, sought)
         worst = max(lost, key=lambda name: lost[name], default="")
         if not lost or lost[worst] <= LOST:
             return mesh, cells
@@ -272,15 +273,15 @@ def mesh_that_shows(
 
 
 def _lost(
-    mesh: Mesh, cells: IntArray, inside: Volume, labels: IntArray, names: Mapping[int, str], sought: Collection[str]
+    mesh: Mesh, cells: IntArray, there: BoolArray, labels: IntArray, names: Mapping[int, str], sought: Collection[str]
 ) -> dict[str, float]:
-    """Return which part of every zone that is sought, or of its cells, is not the other."""
-    given, there = np.where(cells >= 0, np.array(sorted(names))[mesh.regions[cells]], -1), inside.values != 0
+    """Return which part of every zone that is sought, or of its cells, is not the other, of the voxels that are `there` (nz, ny, nx)."""
+    given = np.where(cells >= 0, np.array(sorted(names))[mesh.regions[cells]], -1)
     lost = {}
     for label, name in names.items():
         if name in sought:
-            zone, own = there & (labels == label), given == label
-            lost[name] = 1.0 - float((zone & own).sum() / max(zone.sum(), own.sum()))
+            zone, own = there & (labels == label), there & (given == label)
+            lost[name] = 1.0 - float((zone & own).sum() / max(zone.sum(), own.sum(), 1))
     return lost
 
 
@@ -316,16 +317,27 @@ def misplaced(mesh: Mesh, cell_of_voxel: IntArray, inside: Volume, labels: IntAr
     return float(np.mean(cells < 0)), float(np.mean((cells >= 0) & wrong))
 
 
-def blurred(left_out: float, wrong: float, *, corrected: bool) -> tuple[str, ...]:
-    """Say what cubes make of the object, from `misplaced`, and whether moduli are corrected for it; nothing of less than one per cent."""
+def lost_parts(mesh: Mesh, cell_of_voxel: IntArray, labels: IntArray, names: Mapping[int, str]) -> dict[str, float]:
+    """Return which part of every zone, or of its cubes, is not the other, by name; what cubes leave out of the object does not count."""
+    return _lost(mesh, cell_of_voxel, cell_of_voxel >= 0, labels, names, names.values())
+
+
+def ends_within(wrong: float, lost: Mapping[str, float]) -> bool:
+    """Whether zones end inside of cubes, so that moduli need a correction: from `misplaced` and `lost_parts`."""
+    return wrong >= BLURRED or max(lost.values(), default=0.0) >= OF_ZONE
+
+
+def blurred(left_out: float, wrong: float, lost: Mapping[str, float], *, corrected: bool) -> tuple[str, ...]:
+    """Say what cubes make of the object, from `misplaced` and `lost_parts`, and whether moduli are corrected for it; if little, nothing."""
     cost = "what this costs is not in the intervals; compare with other sizes of elements."
     told = []
     if left_out >= BLURRED:
         told.append(f"The cubes leave out {100 * left_out:.2g} % of the object, at its surface: {cost}")
-    if wrong >= BLURRED:
+    if ends_within(wrong, lost):
         own = "moduli are corrected for what cubes of half the size change, and as much is part of their standard deviations."
-        told.append(
-            f"The cubes assign {100 * wrong:.2g} % of the object to another zone, because zones end inside of them: "
-            f"{own if corrected else cost}"
-        )
+        worst = max(lost, key=lambda name: lost[name], default="")
+        small = wrong < BLURRED  # in all, but much of a small zone
+        what = f"share only {100 * (1.0 - lost[worst]):.2g} % of their volume with {worst}" if small else ""
+        all_of_it = f"assign {100 * wrong:.2g} % of the object to another zone"
+        told.append(f"The cubes {what or all_of_it}, because zones end inside of them: {own if corrected else cost}")
     return tuple(told)

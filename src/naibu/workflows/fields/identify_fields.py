@@ -217,8 +217,7 @@ def identify_fields(
         size = element_size_mm or scanned.edge_mm(usual)
     cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
-    if check_components:
-        require_likely_components(scanned, points, progress)
+    doubts, untold = require_likely_components(scanned, points, stated, progress) if check_components else ((), ())
     if stated is NOTHING_KNOWN:
         found = identify_relative_map(cubes.mesh, cubes.load_cases, law=law, bounds=stated.bounds, progress=progress)
     else:
@@ -234,18 +233,20 @@ def identify_fields(
         strain=max(relative_deformation(case.field) for case in cubes.load_cases),
         provenance={"naibu": __version__, "known": list(known), "loaded": list(loaded), "inputs": dict(inputs)}, region_at=cubes.region_at,
     )  # fmt: skip
-    notes, told = _told(found, cubes, longer)
+    notes, told = _told(found, cubes, doubts, (*untold, *longer))
     own = () if scanned.covering is None else tuple(name for name in scanned.covering.names if name not in given.values)
     result = FieldIdentification(found, body, stated.relative, notes, told, inside, cubes.cell_of_voxel, scanned.covering, own)
     return result if folder is None else replace(result, files=written_together(folder, FILES, lambda at: _written(at, result)))
 
 
-def _told(found: FieldEstimate, cubes: ObjectOnCubes, longer: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _told(
+    found: FieldEstimate, cubes: ObjectOnCubes, doubts: tuple[str, ...], longer: Sequence[str]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return all that is to be told of a result, and of that what makes the fields doubtful and what cubes leave out or count as noise."""
     corrected, scanned = cubes.region_at is not None and found.mesh_shift is not None, cubes.scanned
-    doubts = tuple(told for name, field in scanned.fields for told in beyond_object(name, field, scanned.whole))
+    doubts += tuple(told for name, field in scanned.fields for told in beyond_object(name, field, scanned.whole))
     doubts += tuple(told for case in cubes.load_cases for told in doubts_of_field(case.name, case.field))
-    coarse = (*blurred(cubes.left_out, cubes.wrong, corrected=corrected), *cubes.noise)
+    coarse = (*blurred(cubes.left_out, cubes.wrong, cubes.lost, corrected=corrected), *cubes.noise)
     return (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer), (*doubts, *coarse)
 
 

@@ -8,16 +8,30 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
-from naibu.core.progress import Progress
+from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.assumptions.component_order import LikelierOrder, likelier_order
+from naibu.identification.from_fields.assumptions.volume_change import VolumeChange, volume_change
+from naibu.identification.from_fields.forward.load_cases import is_surface_sought
+from naibu.workflows.fields.known_zones import KnownZones
 from naibu.workflows.fields.object_on_cubes import ScannedObject
 
 CUBES = 300  # of the object: components in a wrong order show on coarse ones
 MOST_NAMED = 3  # arrangements that are about as likely
+COMPRESSIBLE = 0.4  # Poisson's ratio of a known zone below which a body may well change its volume
+UNTOLD = (
+    "{}: where forces may act on the whole surface, this field does not tell the signs of single components: its volume changes {:.2g} "
+    "times as much as its shape, with another sign of u{} {:.2g} times as much. They are taken as they are; naming the sides at which "
+    "forces act (`loaded`) has them checked."
+)
 
 
-def require_likely_components(scanned: ScannedObject, points: int, progress: Progress | None = None) -> None:
+def require_likely_components(
+    scanned: ScannedObject, points: int, known: KnownZones, progress: Progress | None = None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Refuse fields that suit an elastic body far better with their components in another order or of other signs.
+
+    Where forces may act on the whole surface, what tells is that bodies hardly change their volume, unless a zone is known that may. An
+    order that is only doubtful is told.
 
     Parameters
     ----------
@@ -25,8 +39,15 @@ def require_likely_components(scanned: ScannedObject, points: int, progress: Pro
         The object and its fields.
     points : int
         Number of measurements of the field that has most.
+    known : KnownZones
+        What is stated of zones.
     progress : callable, optional
         Gets reports.
+
+    Returns
+    -------
+    doubts, untold : tuple of str
+        In words: what is doubtful, and what the fields do not tell.
 
     Raises
     ------
@@ -34,9 +55,43 @@ def require_likely_components(scanned: ScannedObject, points: int, progress: Pro
         What is likely wrong, and how to mend it or to go on nevertheless.
     """
     cubes = scanned.on_cubes(scanned.edge_mm(max(min(CUBES, points // 2), 64)), (), exactly=False, each_cell=True)
+    names = ", ".join(case.name for case in cubes.load_cases)
     found = likelier_order(cubes.mesh, cubes.load_cases, progress)
     if found is not None:
-        raise InputError(f"{', '.join(case.name for case in cubes.load_cases)}: {told_order(found)}")
+        raise InputError(f"{names}: {told_order(found)}")
+    if not is_surface_sought(cubes.mesh, cubes.load_cases):
+        return (), ()
+    report_progress(progress, "comparing how much volume and shape change")
+    compressible = any(poisson < COMPRESSIBLE for zone, (_, poisson) in known.values.items() if zone in known.not_rigid)
+    doubts, untold = [], []
+    for case in cubes.load_cases:
+        changed = volume_change(cubes.mesh, case)
+        if changed.wrong_sign and not compressible:
+            raise InputError(f"{case.name}: {told_sign(changed)}")
+        if changed.doubtful_order and not compressible:
+            doubts.append(f"{case.name}: {told_doubt(changed)}")
+        elif not changed.signs_told:
+            untold.append(UNTOLD.format(case.name, changed.given, "xyz"[changed.component], changed.flipped))
+    return tuple(doubts), tuple(untold)
+
+
+def told_sign(found: VolumeChange) -> str:
+    """Return in words that the sign of a component is likely wrong, and what to do."""
+    others = " and ".join(f"u{axis}" for k, axis in enumerate("xyz") if k != found.component)
+    return (
+        f"the volume changes {_times(found.given)} as much as the shape, as it does in no gel or tissue; with another sign of "
+        f"u{'xyz'[found.component]} it would change {_times(found.flipped)} as much. Components are likely not in the frame of the "
+        f"positions: change the sign of u{'xyz'[found.component]}, or else of {others}. If they are right, as of a foam that is squeezed "
+        "from several sides, state a zone of it as known with its Poisson's ratio, or give check_components=False"
+    )
+
+
+def told_doubt(found: VolumeChange) -> str:
+    """Return in words that components are perhaps in another order."""
+    return (
+        f"the volume changes {_times(found.given)} as much as the shape, and would change {_times(found.reordered)} as much if components "
+        f"were in another order. That is right of a sponge or foam; of a gel or tissue, {_mend(found.order)}."
+    )
 
 
 def told_order(found: LikelierOrder) -> str:
@@ -52,6 +107,10 @@ def told_order(found: LikelierOrder) -> str:
 
 def _percent(share: float) -> str:
     return f"{100.0 * share:.2g} %"
+
+
+def _times(share: float) -> str:
+    return f"{share:.2g} times"
 
 
 def _mend(matrix: FloatArray) -> str:

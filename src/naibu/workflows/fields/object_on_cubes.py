@@ -22,7 +22,7 @@ from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.mesh_error import one_cell_thick
 from naibu.identification.from_fields.verdict import LEAST_POINTS
-from naibu.workflows.fields.block_mesh import BLURRED, misplaced, moved_borders, region_in, regions_of
+from naibu.workflows.fields.block_mesh import ends_within, lost_parts, misplaced, moved_borders, region_in, regions_of
 from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.contradicted_measurements import without_contradicted
 from naibu.workflows.fields.known_zones import KnownZones
@@ -100,22 +100,27 @@ class ScannedObject:
         """Return the object on cubes of an edge length (see `mesh_that_shows`), moved onto borders of zones unless it is to be mapped."""
         covered = np.zeros(self.inside.shape, dtype=bool) if self.covering is None else self.covering.voxels
         mesh, cell_of_voxel = mesh_on_what_is_left(self.inside, self.labels, self.names, sought, size_mm, covered, exactly=exactly)
-        left_out, wrong = misplaced(mesh, cell_of_voxel, self.inside, self.labels, self.names)
-        if not each_cell and wrong >= BLURRED and self.covering is None:
+        left_out, wrong, lost = self._misplaced(mesh, cell_of_voxel)
+        if not each_cell and ends_within(wrong, lost) and self.covering is None:
             mesh, cell_of_voxel = fitted_to_borders(mesh, cell_of_voxel, self.inside, regions_of(self.labels, self.names))
-            left_out, wrong = misplaced(mesh, cell_of_voxel, self.inside, self.labels, self.names)
+            left_out, wrong, lost = self._misplaced(mesh, cell_of_voxel)
         all_measured = [measured_load_case(mesh, cell_of_voxel, self.inside, field, name, self.loaded) for name, field in self.fields]
         if self.covering is not None:
             below = loaded_below(mesh, self.covering.voxels, self.inside)
             all_measured = [replace(case, loaded=case.loaded | below[:, None]) for case in all_measured]
         cases, outliers = zip(*map(without_contradicted, all_measured), strict=True)
         words = tuple(text for told in outliers for text in told)
-        noisy = [with_noise_of_neighbours(mesh, case) if each_cell or case.field.covariance is not None else (case, 1.0) for case in cases]
+        noisy = [with_noise_of_neighbours(mesh, case) for case in cases]
         words += tuple(text for case, factor in noisy for text in _told_noise(case, factor))
         coarser = [(case, 0.0) if each_cell else with_representation_error(mesh, case) for case, _ in noisy]
         words += tuple(UNRESOLVED.format(case.name, 100 * part) for case, part in coarser if part > 0.0)
-        within = None if each_cell or wrong < BLURRED else region_in(self.inside, self.labels, self.names)
-        return ObjectOnCubes(self, mesh, cell_of_voxel, tuple(case for case, _ in coarser), words, left_out, wrong, within)
+        within = region_in(self.inside, self.labels, self.names) if not each_cell and ends_within(wrong, lost) else None
+        return ObjectOnCubes(self, mesh, cell_of_voxel, tuple(case for case, _ in coarser), words, left_out, wrong, lost, within)
+
+    def _misplaced(self, mesh: Mesh, cell_of_voxel: IntArray) -> tuple[float, float, dict[str, float]]:
+        """Return which parts of the object cubes leave out and assign to another zone, and which part of every zone is not its cubes'."""
+        wrong = misplaced(mesh, cell_of_voxel, self.inside, self.labels, self.names)
+        return *wrong, lost_parts(mesh, cell_of_voxel, self.labels, self.names)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -136,6 +141,8 @@ class ObjectOnCubes:
         What counts as noise of measurements beyond what is stated, in words.
     left_out, wrong : float
         Parts of the object that cubes leave out, and assign to another zone.
+    lost : mapping
+        Which part of every zone, or of its cubes, is not the other.
     region_at : callable or None
         Region of the mesh at points, where zones end inside of cubes.
     """
@@ -147,6 +154,7 @@ class ObjectOnCubes:
     noise: tuple[str, ...]
     left_out: float
     wrong: float
+    lost: Mapping[str, float]
     region_at: RegionAt | None
 
     def identified(

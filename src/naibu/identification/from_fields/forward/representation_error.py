@@ -112,6 +112,52 @@ def _variance(mesh: Mesh, field: DisplacementField) -> FloatArray:
     return np.asarray(np.where(significant, factor * beyond, 0.0)[found.cells] * stated)
 
 
+def nearest_interpolated(mesh: Mesh, field: DisplacementField) -> FloatArray:
+    """Return the displacement of the nodes (n, d), mm, that is nearest to the valid measurements of a field in units of their noise.
+
+    Where no covariance is stated, that is a small part of the largest displacement.
+    """
+    points, vectors = field.points[field.valid], field.vectors[field.valid]
+    variance = np.full(len(points), (EXACT * float(np.abs(vectors).max())) ** 2)
+    if field.covariance is not None:
+        variance = np.maximum(np.trace(field.covariance[field.valid], axis1=1, axis2=2) / vectors.shape[1], 1e-12 * variance)
+    return _Nearest.of(mesh, points, variance).nodes(vectors / np.sqrt(variance)[:, None])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Nearest:
+    """Interpolated displacements nearest to measurements at points.
+
+    Attributes
+    ----------
+    cells : ndarray, shape (k,), int64
+        Cell of every point.
+    whole : csr_matrix, shape (k, n)
+        Interpolation at the points, over the standard deviation there, 1/mm.
+    matrix : csr_matrix, shape (n, n)
+        Of the normal equations, 1/mm^2.
+    """
+
+    cells: IntArray
+    whole: sp.csr_matrix
+    matrix: sp.csr_matrix
+
+    @classmethod
+    def of(cls, mesh: Mesh, points: FloatArray, variance: FloatArray) -> _Nearest:
+        """Weigh measurements at points (k, d), mm, of a variance (k,) of components, mm^2, against smoothness."""
+        at = locate(mesh, points, tolerance_mm=np.inf)
+        rows = np.repeat(np.arange(len(variance)), at.weights.shape[1])
+        within = sp.csr_matrix((at.weights.ravel(), (rows, mesh.cells[at.cells].ravel())), shape=(len(variance), mesh.n_points))
+        whole = sp.csr_matrix(sp.diags(variance**-0.5) @ within)
+        return cls(at.cells, whole, (whole.T @ whole + _smoothness(mesh)).tocsr())
+
+    def nodes(self, values: FloatArray) -> FloatArray:
+        """Return the values at the nodes (n, r), mm, nearest to those measured (k, r), in units of their standard deviations."""
+        inverse_diagonal = sp.diags(1.0 / self.matrix.diagonal())
+        right = self.whole.T @ values
+        return np.stack([cg(self.matrix, b, rtol=1e-6, maxiter=2000, M=inverse_diagonal)[0] for b in right.T], axis=1)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Scatter:
     """Measurements about the nearest interpolated displacement.
@@ -140,16 +186,10 @@ class _Scatter:
         assert field.covariance is not None
         d, n = field.vectors.shape[1], mesh.n_points
         stated = np.trace(field.covariance, axis1=1, axis2=2) / d
-        at = locate(mesh, field.points, tolerance_mm=np.inf)
-        rows = np.repeat(np.arange(len(stated)), at.weights.shape[1])
-        within = sp.csr_matrix((at.weights.ravel(), (rows, mesh.cells[at.cells].ravel())), shape=(len(stated), n))
-        whole = sp.diags(stated**-0.5) @ within
-        matrix = (whole.T @ whole + _smoothness(mesh)).tocsr()
-        inverse_diagonal = sp.diags(1.0 / matrix.diagonal())
+        nearest = _Nearest.of(mesh, field.points, stated)
 
         def followed(values: FloatArray) -> FloatArray:
-            right = whole.T @ values
-            return np.stack([whole @ cg(matrix, b, rtol=1e-6, maxiter=2000, M=inverse_diagonal)[0] for b in right.T], axis=1)
+            return np.asarray(nearest.whole @ nearest.nodes(values))
 
         measured = field.vectors / np.sqrt(stated)[:, None]
         left = ((measured - followed(measured)) ** 2).sum(axis=1) / d
@@ -160,9 +200,9 @@ class _Scatter:
         )
         near = sp.csr_matrix(touched @ touched.T)
         near.data[:] = 1.0
-        squares, freedom, count = (near @ np.bincount(at.cells, v, mesh.n_cells) for v in (left, free, np.ones_like(free)))
+        squares, freedom, count = (near @ np.bincount(nearest.cells, v, mesh.n_cells) for v in (left, free, np.ones_like(free)))
         enough = freedom > np.maximum(FEWEST * count, 1.0)
-        return cls(at.cells, squares / np.maximum(freedom, 1.0), freedom, enough, float(free.sum()))
+        return cls(nearest.cells, squares / np.maximum(freedom, 1.0), freedom, enough, float(free.sum()))
 
 
 def _smoothness(mesh: Mesh) -> sp.csr_matrix:

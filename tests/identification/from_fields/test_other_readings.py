@@ -1,0 +1,94 @@
+"""Fields with all vectors reversed, or standing where points came to lie: told by the parts of second order, and true ones not accused.
+
+The fields are those of cells half as wide as the model's, at points that are no nodes, with noise; those of small strain are computed by
+code that shares nothing with ours (`naibu.validation.specimens.quadratic_body`).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from naibu.core.arrays import FloatArray
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.assumptions.other_readings import DECISIVE, Reading, judged_readings
+from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.field_estimate import FieldEstimate
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.verdict import Explanation, Verdict
+from naibu.mechanics.finite_elements.assembly import Assembler
+from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
+from naibu.mechanics.finite_elements.elements import elements
+from naibu.mechanics.finite_elements.hyperelasticity import material
+from naibu.mechanics.finite_strain.problem import Problem
+from naibu.mechanics.finite_strain.statics import solve
+from naibu.meshing.point_location import interpolation_operator
+from naibu.meshing.primitives import box
+from naibu.meshing.surface import boundary_nodes, side_nodes
+from naibu.validation.specimens.quadratic_body import QuadraticBody
+
+PUSHES = {"pressed": (0.0, 0.0, -5.0), "pulled": (1.0, 0.0, 5.0), "sheared": (6.0, 0.0, -2.0)}
+SD_MM = 0.02
+EXPLAINED = Verdict(Explanation.EXPLAINED, (), "residuals are 1 times the noise", 1.0, 0.0, 0.0)
+
+
+@cache
+def displaced(push: str) -> tuple[Mesh, FloatArray]:
+    """Return a cube of cells of 2.5 mm, its lower half softer, and how its nodes move, at finite strain."""
+    mesh = box([40.0] * 3, [16] * 3, centred=False)
+    upper = (mesh.points[mesh.cells].mean(axis=1)[:, 2] > 20.0).astype(np.int64)
+    mesh = Mesh.from_arrays(mesh.points, mesh.cells, "hexahedron", regions=upper, region_names=("unknown", "known"))
+    materials = [material("neo_hookean", young_modulus=young, poisson_ratio=0.45) for young in (6.0, 12.0)]
+    held = PrescribedDisplacement.none(mesh.n_points).and_also(side_nodes(mesh, "z-"), (0.0, 0.0, 0.0))
+    held = held.and_also(side_nodes(mesh, "z+"), PUSHES[push])
+    body = Assembler.from_materials(elements(mesh, "mean_dilatation"), mesh.regions, materials)
+    return mesh, solve(Problem(mesh.points, body, (), held, np.zeros_like(mesh.points))).displacement
+
+
+@cache
+def found(push: str, kind: str) -> FieldEstimate:
+    """Identify the lower half of a cube, whose upper half is known, where forces may act on the whole surface."""
+    rng = np.random.default_rng(11)
+    points = rng.uniform(2.0, 38.0, (1200, 3))
+    if kind == "small strain":
+        points, u = QuadraticBody("cube", (6.0, 0.45), (12.0, 0.45)).solved(PUSHES[push], divisions=4).at(points / 40.0)
+    else:
+        mesh, of_nodes = displaced(push)
+        u = interpolation_operator(mesh, points) @ of_nodes
+    u = u + SD_MM * rng.standard_normal(u.shape)
+    model = box([40.0] * 3, [8] * 3, centred=False)
+    upper = (model.points[model.cells].mean(axis=1)[:, 2] > 20.0).astype(np.int64)
+    model = Mesh.from_arrays(model.points, model.cells, "hexahedron", regions=upper, region_names=("unknown", "known"))
+    if kind == "later":
+        points = points + u
+        kept = ((points > 0.0) & (points < 40.0)).all(axis=1)
+        points, u = points[kept], u[kept]
+    field = DisplacementField.from_arrays(points, -u if kind == "reversed" else u, sd_mm=SD_MM)
+    everywhere = np.isin(np.arange(model.n_points), boundary_nodes(model))
+    zones = Zones.of(model, known={"known": (12.0, 0.45)})
+    return identify_field(model, [FieldLoadCase.of("push", field, model, loaded=everywhere)], zones, law="neo_hookean")
+
+
+@pytest.mark.parametrize("kind", ["right", "small strain"])
+@pytest.mark.parametrize("push", PUSHES)
+def test_a_true_field_is_not_accused(push: str, kind: str) -> None:
+    assert "fit far better" not in found(push, kind).identifiability[0]
+
+
+@pytest.mark.parametrize(("push", "kind"), [("pressed", "reversed"), ("pulled", "reversed"), ("sheared", "reversed"), ("sheared", "later")])
+def test_another_reading_is_told_or_left_open(push: str, kind: str) -> None:
+    told = " ".join(found(push, kind).identifiability)
+    assert "fit far better with all displacements reversed" in told or "fit as well with all displacements reversed" in told
+
+
+def test_what_fits_as_well_is_a_note_and_what_fits_worse_nothing() -> None:
+    none = np.zeros(2)
+    judged = judged_readings(EXPLAINED, [Reading("this", none, 0.3 * DECISIVE), Reading("that", none, -3.0 * DECISIVE)])
+    assert judged.explanation is Explanation.EXPLAINED and not judged.reasons
+    assert judged.notes == ("The fields would fit as well with this: that they are not is taken for given.",)
+    assert judged_readings(EXPLAINED, [Reading("that", none, -3.0 * DECISIVE)]) == EXPLAINED
+    against = judged_readings(EXPLAINED, [Reading("this", none, 2.0 * DECISIVE)])
+    assert against.explanation is Explanation.IN_PART and "with this (chi squared falls by 32): check signs" in against.reasons[0]

@@ -1,0 +1,84 @@
+"""The sign of one component is told from the change of volume of the field; no true field of an uneven body is accused.
+
+The fields are those of quadratic hexahedra at points that are no nodes, with noise (`naibu.validation.specimens.quadratic_body`).
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from naibu.core.displacement_field import DisplacementField
+from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.assumptions.volume_change import VolumeChange, volume_change
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
+from naibu.meshing.surface import boundary_nodes
+from naibu.validation.specimens.quadratic_body import Inclusion, QuadraticBody
+
+NOISE = 0.01  # of the largest displacement
+TWO = (Inclusion((10.0, 20.0, 20.0), 8.0, 100.0, 0.3), Inclusion((30.0, 22.0, 18.0), 9.0, 0.5, 0.49))
+BODIES = {
+    "alike": QuadraticBody("cube", (10.0, 0.47), (10.0, 0.47)),
+    "layers": QuadraticBody("cube", (5.0, 0.3), (500.0, 0.3)),
+    "soft below": QuadraticBody("cube", (1.0, 0.499), (100.0, 0.3)),
+    "stiff lump": QuadraticBody("cube", (10.0, 0.45), (10.0, 0.45), (Inclusion((18.0, 22.0, 19.0), 11.0, 1000.0, 0.3),)),
+    "soft lump": QuadraticBody("cube", (10.0, 0.3), (10.0, 0.3), (Inclusion((18.0, 22.0, 19.0), 11.0, 0.5, 0.3),)),
+    "lumps": QuadraticBody("cube", (10.0, 0.499), (20.0, 0.4), TWO),
+    "sponge": QuadraticBody("cube", (10.0, 0.05), (10.0, 0.05)),
+    "barrel": QuadraticBody("barrel", (5.0, 0.45), (10.0, 0.4)),
+    "tapered": QuadraticBody("tapered", (5.0, 0.49), (100.0, 0.4)),
+}
+PUSHES = ((0.0, 0.0, -4.0), (2.0, -1.0, -3.0), (0.0, 0.0, 5.0), (4.0, 0.0, 0.0), (-2.0, 3.0, 1.0))
+HARDLY_COMPRESSIBLE = ("alike", "soft below", "stiff lump", "lumps", "barrel", "tapered")
+
+
+@cache
+def field_of(name: str, push: tuple[float, float, float]) -> tuple[Mesh, np.ndarray, np.ndarray]:
+    mesh, _ = BODIES[name].model(6, "hexahedron")
+    rng = np.random.default_rng(7)
+    points, u = BODIES[name].solved(push, divisions=4).at(rng.uniform(0.02, 0.98, (1000, 3)))
+    return mesh, points, u + NOISE * np.abs(u).max() * rng.standard_normal(u.shape)
+
+
+def found(name: str, push: tuple[float, float, float], matrix: np.ndarray) -> VolumeChange:
+    mesh, points, u = field_of(name, push)
+    field = DisplacementField.from_arrays(points, u @ matrix.T, sd_mm=NOISE * float(np.abs(u).max()))
+    everywhere = np.isin(np.arange(mesh.n_points), boundary_nodes(mesh))
+    return volume_change(mesh, FieldLoadCase.of("push", field, mesh, loaded=everywhere))
+
+
+@pytest.mark.parametrize("reverse", [1.0, -1.0])
+@pytest.mark.parametrize("push", PUSHES)
+@pytest.mark.parametrize("name", BODIES)
+def test_true_fields_are_not_accused(name: str, push: tuple[float, float, float], reverse: float) -> None:
+    judged = found(name, push, reverse * np.eye(3))
+    assert not judged.wrong_sign
+    assert judged.given < 2.5 * judged.flipped
+    if name in HARDLY_COMPRESSIBLE:
+        assert not judged.doubtful_order
+
+
+@pytest.mark.parametrize("component", range(3))
+@pytest.mark.parametrize("push", [(0.0, 0.0, -4.0), (2.0, -1.0, -3.0), (0.0, 0.0, 5.0)])
+@pytest.mark.parametrize("name", HARDLY_COMPRESSIBLE)
+def test_a_changed_sign_is_told_with_the_component(name: str, push: tuple[float, float, float], component: int) -> None:
+    """Two of them are the third one and all reversed."""
+    one = np.where(np.arange(3) == component, -1.0, 1.0)
+    for signs in (one, -one):
+        judged = found(name, push, np.diag(signs))
+        assert judged.wrong_sign
+        assert judged.component == component
+
+
+def test_another_order_of_a_gel_is_doubted() -> None:
+    judged = found("alike", (2.0, -1.0, -3.0), np.eye(3)[[2, 1, 0]])
+    assert judged.doubtful_order
+    assert any(np.array_equal(judged.order @ np.eye(3)[[2, 1, 0]], sign * np.eye(3)) for sign in (1.0, -1.0))
+
+
+def test_a_shear_of_a_gel_tells_no_signs() -> None:
+    """Sheared to and fro it is the same body."""
+    assert not found("alike", (4.0, 0.0, 0.0), np.eye(3)).signs_told
+    assert found("alike", (0.0, 0.0, -4.0), np.eye(3)).signs_told
