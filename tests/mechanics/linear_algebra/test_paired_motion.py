@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
-from naibu.mechanics.linear_algebra.direct import SuperLUSolver
+from naibu.mechanics.linear_algebra.direct import SuperLUSolver, pardiso_library
 from naibu.mechanics.linear_algebra.paired_motion import PairedMotion, forces_along, relative
+from naibu.mechanics.linear_algebra.schur_complement import PardisoSchurSolver
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
 N = 10
@@ -30,9 +32,16 @@ def directions() -> FloatArray:
     return np.asarray(out / np.linalg.norm(out, axis=1)[:, None])
 
 
-def test_pairs_move_as_the_whole_matrix_says() -> None:
+@pytest.mark.parametrize("condensed", [None, [3, 5], [3, 8]])
+def test_pairs_move_as_the_whole_matrix_says(condensed: list[int] | None) -> None:
+    if condensed and pardiso_library() is None:
+        pytest.skip("needs oneMKL")
     matrix, along = stiffness(), directions()
-    factors = UpdatedFactors(SuperLUSolver().factorize(sp.bsr_matrix(matrix, blocksize=(3, 3))), N)
+    blocks = sp.bsr_matrix(matrix, blocksize=(3, 3))
+    solver = PardisoSchurSolver(blocks) if condensed else SuperLUSolver()
+    if isinstance(solver, PardisoSchurSolver):
+        solver.condense(np.array(condensed))
+    factors = UpdatedFactors(solver.factorize(blocks), N)
     forces = np.zeros((len(NODES), N, 3))
     for own, (first, second), unit in zip(forces, NODES, along, strict=True):
         own[second] += unit

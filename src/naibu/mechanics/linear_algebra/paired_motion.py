@@ -32,17 +32,22 @@ class PairedMotion:
         Unit vectors.
     inverse : ndarray, shape (p, p), float32
         ``B^T A^-1 B`` with the matrix A and the forces B of unit size: on the second nodes along, on the first ones against the directions.
+    of_condensed : ndarray, shape (p, 3 l), float32
+        ``B^T A^-1`` for the l nodes whose part of the inverse came with the factors, by the symmetry of A.
     """
 
     numbers: IntArray
     nodes: IntArray
     directions: FloatArray
     inverse: NDArray[np.float32]
+    of_condensed: NDArray[np.float32]
 
     @classmethod
     def of(cls, factors: UpdatedFactors, numbers: IntArray, nodes: IntArray, directions: FloatArray, held: IntArray) -> Self:
         """Compute the relative motion of pairs, see the attributes; forces on nodes that are held (h,) move nothing."""
         inverse = np.empty((len(nodes), len(nodes)), dtype=np.float32, order="F")
+        there = factors.condensed
+        of_condensed = np.empty((len(nodes), len(there), 3), dtype=np.float32)
         for first in range(0, len(nodes), COLUMNS):
             some = slice(first, first + COLUMNS)
             unit = np.zeros((3 * factors.n_points, len(nodes[some])), order="F")
@@ -51,14 +56,16 @@ class PairedMotion:
                 unit[3 * nodes[some, 1] + c, at] += directions[some, c]
                 unit[3 * nodes[some, 0] + c, at] -= directions[some, c]
                 unit[3 * held + c] = 0.0
-            inverse[:, some] = relative(factors.solve_all(unit), nodes, directions)
-        return cls(numbers, nodes, directions, inverse)
+            motion = factors.solve_all(unit)
+            inverse[:, some] = relative(motion, nodes, directions)
+            of_condensed[some] = motion.reshape(-1, 3, len(at))[there].transpose(2, 0, 1)
+        return cls(numbers, nodes, directions, inverse, of_condensed.reshape(len(nodes), -1))
 
     @classmethod
     def none(cls) -> Self:
         """Return no pairs."""
         empty = np.zeros(0, dtype=np.int64)
-        return cls(empty, empty.reshape(0, 2), np.zeros((0, 3)), np.zeros((0, 0), dtype=np.float32))
+        return cls(empty, empty.reshape(0, 2), np.zeros((0, 3)), *(np.zeros((0, 0), dtype=np.float32),) * 2)
 
     @property
     def n_pairs(self) -> int:
@@ -67,7 +74,11 @@ class PairedMotion:
 
     def under(self, factors: UpdatedFactors, nodes: IntArray) -> NDArray[np.float32]:
         """Return the relative motion (p, 3 k) under unit forces on nodes (k,), whose part of the inverse is known."""
-        return factors.of_columns(nodes, lambda columns: relative(columns, self.nodes, self.directions).astype(np.float32))
+
+        def of(columns: NDArray[np.float32]) -> NDArray[np.float32]:
+            return relative(columns, self.nodes, self.directions).astype(np.float32)
+
+        return factors.of_columns(nodes, of, self.of_condensed)
 
 
 def relative(x: FloatArray | NDArray[np.float32], nodes: IntArray, directions: FloatArray) -> FloatArray:

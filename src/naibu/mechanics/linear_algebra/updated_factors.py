@@ -121,7 +121,7 @@ class UpdatedFactors:
         """Take the part between the nodes out of the columns; it is of the order of its square, and not done after every few nodes."""
         if len(self._inverse) == 3 * len(self._nodes):
             return
-        of_factors = 3 * len(self._nodes) - sum(columns.shape[1] for columns in self._columns)
+        of_factors = 3 * len(self.condensed)
         at, whole = _rows(self._nodes), np.empty((3 * len(self._nodes),) * 2, dtype=np.float32, order="F")
         whole[:of_factors, :of_factors] = self._inverse[:of_factors, :of_factors]
         whole[:, of_factors:] = np.concatenate([part.T.take(at, axis=1) for part in self._columns]).T
@@ -142,13 +142,21 @@ class UpdatedFactors:
         """Return the solutions (3 n, r) for right sides (3 n, r) in the order of columns."""
         return np.asarray(self.factors.solve(b))
 
-    def of_columns(self, nodes: IntArray, of: Callable[[NDArray[np.float32]], NDArray[np.float32]]) -> NDArray[np.float32]:
-        """Return what a linear function makes of the columns (3 n, 3 k) of the inverse that belong to nodes (k,): (p, 3 k)."""
+    @property
+    def condensed(self) -> IntArray:
+        """The nodes (k,) whose part of the inverse came with the factors, without columns: in a symmetric matrix only."""
+        return self._nodes[: len(self._nodes) - sum(columns.shape[1] for columns in self._columns) // 3]
+
+    def of_columns(
+        self, nodes: IntArray, of: Callable[[NDArray[np.float32]], NDArray[np.float32]], of_condensed: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """Return what a linear function makes of the columns (3 n, 3 k) of the inverse that belong to nodes (k,): (p, 3 k).
+
+        `of_condensed` (p, 3 l) is what it makes of the columns of the l nodes that are `condensed`.
+        """
         self._add(np.unique(nodes[self._slot[nodes] < 0]))
-        known = [of(columns) for columns in self._columns]
-        return (
-            np.concatenate(known, axis=1)[:, _rows(self._slot[nodes])] if len(nodes) else of(np.zeros((3 * self.n_points, 0), np.float32))
-        )
+        known = [of_condensed, *(of(columns) for columns in self._columns)]
+        return np.concatenate(known, axis=1)[:, _rows(self._slot[nodes])]
 
     def between(self, nodes: IntArray) -> NDArray[np.float32]:
         """Return the part of the inverse (3 k, 3 k) between nodes (k,), in the order of columns."""
@@ -159,7 +167,7 @@ class UpdatedFactors:
     def add_columns(self, nodes: IntArray, amounts: FloatArray, x: FloatArray) -> None:
         """Add the columns of the inverse that belong to nodes (k,), times amounts (k, 3), to x (3 n,)."""
         slots = self._slot[nodes]
-        first = len(self._nodes) - sum(columns.shape[1] for columns in self._columns) // 3
+        first = len(self.condensed)
         if isinstance(self.factors, PardisoSchurSolver) and amounts[slots < first].any():
             condensed = np.zeros((first, 3))
             condensed[slots[slots < first]] = amounts[slots < first]
