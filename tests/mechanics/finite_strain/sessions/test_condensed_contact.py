@@ -261,7 +261,8 @@ def test_pairs_that_open_and_close_at_once_are_those_of_the_quadratic_programme(
     inverse = springs @ springs.T / count**2 + 1e-4 * np.eye(count)  # loose pieces: few motions that are a thousand times as free
     still, gap = random.standard_normal(count), 0.05 * random.random(count)
     tangent, none = factorized(BODY * np.eye(3)), np.zeros(0, np.int64)
-    pairs = PairedMotion(np.arange(count), np.zeros((count, 2), np.int64), np.zeros((count, 3)), inverse.astype(np.float32))
+    nowhere = np.zeros((count, 0), dtype=np.float32)
+    pairs = PairedMotion(np.arange(count), np.zeros((count, 2), np.int64), np.zeros((count, 3)), inverse.astype(np.float32), nowhere)
     contact = CondensedContact(replace(tangent, pairs=pairs), none, np.full(count // 3, BODY))
     found = found_by(contact.forces(still.reshape(-1, 3), Sides(gap.reshape(-1, 3)), np.zeros((count // 3, 3)), 1e-5, 1e9, 1e-6))
     root = np.linalg.cholesky(inverse + np.eye(count) / WALL).T  # least of |root f + root^-T (gap + still)|, f not negative
