@@ -249,24 +249,26 @@ def pulled(body: FiniteElementBody) -> None:
         simulation.grip(top, 0.08 * simulation.extent_mm)
         at = body.points[top]
         led = [at + part * np.array(way) for part in np.linspace(0.0, 1.0, steps + 1)[1:]]
-        seconds, left, failed = [], [], 0
+        seconds, own, left, failed = [], [], [], 0
         for place in [*led, *[led[-1]] * 5, *[None] * 20]:
             if place is None:
                 simulation.release()
             else:
                 simulation.pull(place)
-            began, under_way = time.process_time(), True
+            began, stepped, under_way = time.process_time(), time.thread_time(), True
             while under_way:
                 frame = simulation.advance()
                 failed += bool(frame.failed)
                 under_way = frame.under_way
             seconds.append(time.process_time() - began)
+            own.append(time.thread_time() - stepped)
             left.append(frame.unbalanced)
         late = np.array(seconds) > 0.3
         print(
             f"{name} and let go, {len(seconds)} steps: {sum(seconds):.1f} s of all threads, {late.sum()} steps above .3 s take "
-            f"{np.array(seconds)[late].sum():.1f} s, worst {max(seconds):.2f} s; out of balance at most {100.0 * max(left):.0f} %, "
-            f"failed {failed}",
+            f"{np.array(seconds)[late].sum():.1f} s, median {1e3 * np.median(seconds):.0f} ms, worst {max(seconds):.2f} s; "
+            f"of the thread that steps {sum(own):.1f} s, median {1e3 * np.median(own):.0f} ms, worst {max(own):.2f} s; "
+            f"out of balance at most {100.0 * max(left):.0f} %, failed {failed}",
             flush=True,
         )
         simulation.close()

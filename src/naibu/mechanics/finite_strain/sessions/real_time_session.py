@@ -45,7 +45,7 @@ STALLED = 0.02  # of the contact forces: what iterations that reduce the error n
 FEW = 200  # nodes of contact at most with which they cost less than a tangent of the step's own
 UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is tried
 SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
-PATIENCE = 2.0  # times
+PATIENCE = 2.0  # times of a tangent, after which iterations are given up: parts take one, and iterations of their own
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 STIFFEST = 16.0  # times the first penalty, to which penalties rise: stiffer ones need more iterations
 RUBBING = 8  # matrices for contacts in an iteration where sides of cuts rub: many pairs stick or slip by turns, and none is held back
@@ -179,7 +179,7 @@ class RealTimeSession(DividedSession):
         return best
 
     def _given_up(self, tangent: EarlierTangent) -> float:
-        """Return the processor time at which iterations that have taken as long as another tangent would are given up for it, or parts."""
+        """Return the processor time at which iterations are given up for another tangent, or parts: where those would have taken less."""
         live = self._engine.background and self._duration == self.engine.step
         return time.thread_time() + max(BUDGET_S, PATIENCE * tangent.seconds) if live else np.inf
 
