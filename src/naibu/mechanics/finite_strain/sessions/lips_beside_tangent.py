@@ -203,7 +203,6 @@ class ApproachingLips:
     exerted: float = field(init=False, default=0.0)
     _at: FloatArray = field(init=False)
     _turned: FloatArray = field(init=False)  # what gaps change by as normals have turned, mm
-    _before: FloatArray = field(init=False)
 
     @classmethod
     def of(cls, lips: CutLips, tangent: EarlierTangent, displacement: FloatArray) -> ApproachingLips:
@@ -219,22 +218,25 @@ class ApproachingLips:
 
     def __post_init__(self) -> None:
         self._at, self._turned = np.zeros(len(self.gap)), np.zeros(len(self.gap))
-        self._before = self._across(self.gap)
 
     def motion(self, displacement: FloatArray) -> FloatArray:
         """Return by how much the sides of each pair go apart along the normals of the tangent (p,), mm, from displacements (n, 3), mm."""
         return relative(displacement.ravel(), self.lips.pairs, self.directions)
+
+    def now(self, n_points: int) -> FloatArray:
+        """Return the forces (3 n,), mN, that the pairs exert on the nodes of the body where they are."""
+        return forces_along(self._across(self.gap), self.lips.pairs, self.normals, n_points)
 
     def slide(self, displacement: FloatArray) -> None:
         """Have the sides slide as nodes are displaced (n, 3), mm."""
         self._turned = relative(displacement.ravel(), self.lips.pairs, self.normals - self.directions)
 
     def forces(self, apart: FloatArray) -> FloatArray:
-        """Return the forces (p,), mN, that part the sides, where they have gone apart (p,), mm, less those that the tangent has."""
+        """Return the forces (p,), mN, that part the sides, where they have gone apart (p,), mm, less what the tangent adds to them."""
         self._at = self.gap + self._turned + apart
         pressing = self._across(self._at)
         self.exerted = 2.0 * float(pressing @ np.abs(self.normals).sum(axis=1))
-        return np.asarray(np.where(self.active, pressing - self._before + self.earlier * apart, 0.0))
+        return np.asarray(np.where(self.active, pressing + self.earlier * apart, 0.0))
 
     def on_nodes(self, amounts: FloatArray, apart: FloatArray, held: IntArray, n_points: int) -> FloatArray:
         """Return the forces (3 n,), mN, on the nodes of the body, of which some (h,) are held, of those on pairs.

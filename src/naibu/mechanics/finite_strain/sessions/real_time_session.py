@@ -324,6 +324,9 @@ class RealTimeSession(DividedSession):
 
     def _with_contact(self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool) -> Generator[None, None, FloatArray]:
         """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are."""
+        sides = self._approaching(tangent, trial.displacement)
+        if sides is not None:  # without what presses now, so that the sides slide by about as much as in the end
+            balance += sides.now(len(balance)).reshape(-1, 3)
         balance[self._constrained] = 0.0
         x = -tangent.factors.solve(balance.ravel())
         free = x.reshape(-1, 3)  # gripped nodes move as well: they are held below
@@ -340,7 +343,6 @@ class RealTimeSession(DividedSession):
         gripped = np.concatenate([*self.bodies[1:], np.zeros(0, np.int64)])
         marked[gripped] = marked[tangent.held] = False
         nodes = np.flatnonzero(marked).astype(np.int64)
-        sides = self._approaching(tangent, trial.displacement)
         if len(nodes) or len(gripped) or sides is not None:
             condensed = self._condensed
             if condensed is None or not condensed.serves(tangent, nodes, gripped):
