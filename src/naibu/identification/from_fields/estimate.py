@@ -152,6 +152,25 @@ def identify_field(
     return recipe.free(point) if name is None else recipe.regularized(point, name, weight, segmented)
 
 
+def homogeneous_moduli(
+    mesh: Mesh, load_cases: Sequence[FieldLoadCase], zones: Zones, *, law: LawName, bounds: Bounds, progress: Progress | None = None
+) -> tuple[float, float, str]:
+    """Return lambda and mu, kPa, of the unknown part of a body if it were homogeneous, and in words what that leaves.
+
+    On larger cells than those of `identify_field` it is a start for that which is found in a small part of the time.
+
+    Raises
+    ------
+    ConvergenceError
+        No equilibrium, or a measured field that does not fix how the loaded nodes move.
+    """
+    model = FieldModel(mesh, load_cases, zones, law, progress=progress)
+    recipe = _Recipe(model, tuple(load_cases), law, "accurate", bounds, [], progress, None, (), None)
+    _, found = recipe.homogeneous()
+    shear, ratio = np.exp(found.point.theta)
+    return float(shear * (ratio - 2.0 / 3.0)), float(shear), recipe.steps[-1]
+
+
 def _doubt(homogeneous: FieldModel, misfit: float) -> str:
     """Return in words what to check where a homogeneous body explains little of a field; empty where it does not."""
     modes = rigid_body_modes(homogeneous.computed.points)
@@ -191,7 +210,15 @@ class _Recipe:
         report_progress(self.progress, "finding how the loaded nodes move", done=0, total=1)
         if given is not None:
             return first_point(self.model, objective.clipped(logarithms(*(np.asarray(g, dtype=float) for g in given))))
-        zones = self.model.zones
+        homogeneous, found = self.homogeneous()
+        theta = np.repeat(found.point.theta, self.model.zones.count)
+        if homogeneous.computed is self.model.computed:
+            return self.model.evaluate(theta, found.point.states)
+        return first_point(self.model, theta)
+
+    def homogeneous(self) -> tuple[FieldModel, Found]:
+        """Return the homogeneous body that fits best."""
+        objective, zones = Objective(bounds=self.bounds), self.model.zones
         homogeneous = self._plain().with_zones(zones.of_one_material())
         known = zones.known_mu[zones.of_cell == KNOWN]
         shear = float(np.exp(np.log(known).mean())) if len(known) else 1.0
@@ -203,10 +230,7 @@ class _Recipe:
             f"homogeneous start: Young's modulus {young[0]:.4g}{zones.unit}, Poisson's ratio {poisson[0]:.3f}, "
             f"misfit {found.point.misfit:.4g} (noise alone: {self.model.n_free:.4g}){_doubt(homogeneous, found.point.misfit)}"
         )
-        theta = np.repeat(found.point.theta, zones.count)
-        if homogeneous.computed is self.model.computed:
-            return self.model.evaluate(theta, found.point.states)
-        return first_point(self.model, theta)
+        return homogeneous, found
 
     def _plain(self) -> FieldModel:
         """Return the model with the elements of the mesh as they are, where these cost less and lead to a start as well."""

@@ -9,11 +9,11 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.core.errors import ConvergenceError
+from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
-from naibu.identification.from_fields.estimate import identify_field
+from naibu.identification.from_fields.estimate import homogeneous_moduli, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
@@ -22,7 +22,7 @@ from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.mesh_error import one_cell_thick
 from naibu.identification.from_fields.verdict import LEAST_POINTS
-from naibu.workflows.fields.block_mesh import ends_within, lost_parts, misplaced, moved_borders, region_in, regions_of
+from naibu.workflows.fields.block_mesh import CELLS, ends_within, lost_parts, misplaced, moved_borders, region_in, regions_of
 from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.contradicted_measurements import without_contradicted
 from naibu.workflows.fields.known_zones import KnownZones
@@ -170,11 +170,30 @@ class ObjectOnCubes:
         """Return the moduli of zones that are not stated (see `identify_field`), from those on coarser cubes where these are known."""
         given = Zones.of(self.mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative)
         borders = moved_borders(self.mesh, self.scanned.inside, self.scanned.labels)
-        start, other = (None, None) if coarser is None else (_start(coarser), coarser.theta)
-        return identify_field(
-            self.mesh, self.load_cases, given, law=law, bounds=bounds, start=start, region_at=self.region_at, borders=borders,
+        begin: tuple[FloatArray, FloatArray] | None = None
+        other: FloatArray | None = None
+        told: tuple[str, ...] = ()
+        if coarser is not None:
+            begin, other = _start(coarser), coarser.theta
+        elif self.mesh.n_cells > MOST_REFINED:
+            begin, told = self._homogeneous(stated, given.count, law, bounds, progress)
+        found = identify_field(
+            self.mesh, self.load_cases, given, law=law, bounds=bounds, start=begin, region_at=self.region_at, borders=borders,
             other_mesh=other, progress=progress,
         )  # fmt: skip
+        return replace(found, steps=(*told, *found.steps))
+
+    def _homogeneous(
+        self, stated: KnownZones, count: int, law: LawName, bounds: Bounds, progress: Progress | None
+    ) -> tuple[tuple[FloatArray, FloatArray] | None, tuple[str, ...]]:
+        """Return lambda and mu (count,), kPa, of a homogeneous body on about `CELLS` cubes to start from, and what it leaves, in words."""
+        try:
+            few = self.scanned.on_cubes(self.scanned.edge_mm(CELLS), (), exactly=True, each_cell=True)
+            zones = Zones.of(few.mesh, known=stated.values, known_sd=stated.doubts, relative=stated.relative)
+            lame, shear, told = homogeneous_moduli(few.mesh, few.load_cases, zones, law=law, bounds=bounds, progress=progress)
+        except (ConvergenceError, InputError):  # of zones that so large cubes do not show
+            return None, ()
+        return (np.full(count, lame), np.full(count, shear)), (f"on {few.mesh.n_cells} larger cubes, {told}",)
 
 
 def _told_noise(case: FieldLoadCase, factor: float) -> tuple[str, ...]:

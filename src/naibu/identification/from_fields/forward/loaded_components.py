@@ -158,6 +158,12 @@ class KeptPreconditioners:
         """Keep the one of load case `t`."""
         self.made[t], self.informed[t] = found, found.informed
 
+    def keep_all(self, others: KeptPreconditioners) -> None:
+        """Keep those that were made of the same load cases under another law."""
+        for t, found in enumerate(others.made):
+            if found is not None:
+                self.keep(t, found)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Solved:

@@ -202,6 +202,7 @@ def first_point(model: FieldModel, theta: FloatArray) -> Point:
         point = model.evaluate(theta, model.from_rest(theta, states))
     except ConvergenceError as error:
         raise ConvergenceError(f"{CANNOT_FOLLOW} ({str(error).partition('. ')[0]})") from error
+    model.boundary.keep_all(small.boundary)  # of thousands of components one takes as long as several iterations of a search
     at = model.linearised(point)
     for t in range(len(model.observed)):
         at.boundary(t)  # after which it is known how many loaded components the measurements determine
