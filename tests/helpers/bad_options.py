@@ -12,6 +12,7 @@ NOT_POSITIVE = ("0", "-0.0", "-1", "-1e-300", "-1e308")
 EXTREME = ("1e308", "1e-300", "1e30", "5e-324")
 NO_COUNTS = ("", "abc", "1e", "5 mm", "2.5", "nan", "inf", "0", "-1", "-" + "9" * 30)
 LENGTH = (*NO_NUMBERS, *NOT_FINITE, *NOT_POSITIVE, *EXTREME)
+NO_DRIFT = ("0", "-0.0", "1e-300", "5e-324")  # of a sensor: states that there is none
 
 
 @dataclass(frozen=True)
@@ -83,6 +84,7 @@ NUMBERS: tuple[tuple[str, tuple[str, ...], str, tuple[str, ...]], ...] = (
     ("simulate", ("{study}",), "--checkpoint-every", NO_COUNTS),
     ("calibrate", ("{study}", "--shapes", "{cloud}"), "--point-sd-mm", LENGTH),
     ("calibrate", ("{study}", "--forces", "{sensor}"), "--force-sd-mn", LENGTH),
+    ("calibrate", ("{study}", "--forces", "{sensor}"), "--force-drift-mn-per-s", tuple(v for v in LENGTH if v not in NO_DRIFT)),
     ("calibrate", ("{study}", "--shapes", "{cloud}"), "--max-runs", NO_COUNTS),
     ("calibrate", ("{study}", "--shapes", "{cloud}"), "--threads", NO_COUNTS),
 )

@@ -140,10 +140,8 @@ def altered(sensor: Path, *, late_ms: float, offset_n: float, drift_n_per_s: flo
     """Let a record be late, and its sensor not tared along z, or drift."""
     lines = sensor.read_text(encoding="utf-8").splitlines()
     rows = [[float(cell) for cell in line.split(",")] for line in lines[1:]]
-    sensor.write_text(
-        "\n".join([lines[0], *(f"{t + late_ms},{x},{y},{z + offset_n + 1e-3 * t * drift_n_per_s}" for t, x, y, z in rows)]),
-        encoding="utf-8",
-    )
+    changed = [f"{t + late_ms},{x},{y},{z + offset_n + 1e-3 * t * drift_n_per_s}" for t, x, y, z in rows]
+    sensor.write_text("\n".join([lines[0], *changed]), encoding="utf-8")
 
 
 def test_a_late_clock_and_a_sensor_that_was_not_tared_are_estimated_and_told(inputs: tuple[Path, Path, Path], tmp_path: Path) -> None:

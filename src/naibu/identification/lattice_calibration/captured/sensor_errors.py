@@ -24,6 +24,7 @@ from naibu.identification.lattice_calibration.captured.recorded_forces import Re
 MOST_DELAY_S = 0.2  # either way
 DELAY_SD_S = 0.2  # weak prior, where forces hardly change
 EXACT_S = 1e-7
+LARGEST_DRIFT = 1e6  # mN/s, of those that are stated
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,13 +57,13 @@ class SensorErrors:
         Raises
         ------
         InputError
-            Another name, a negative standard deviation, or one of 0 beside a drift that is sought.
+            Another name, a standard deviation that is negative or above `LARGEST_DRIFT`, or one of 0 beside a drift that is sought.
         """
         if name not in get_args(SensorErrorNames):
             raise InputError(f"sensor_errors is {name!r}; choose one of {', '.join(get_args(SensorErrorNames))}")
         sd = np.inf if drift_sd is None else drift_sd
-        if not sd >= 0.0:
-            raise InputError(f"force_drift_mn_per_s is {sd:g}: must be 0 or more, mN/s")
+        if drift_sd is not None and not 0.0 <= sd <= LARGEST_DRIFT:
+            raise InputError(f"force_drift_mn_per_s is {sd:g}: must be between 0 and {LARGEST_DRIFT:g} mN/s; leave it out if unknown")
         if "drift" in name and sd == 0.0:
             raise InputError(f"force_drift_mn_per_s is 0, but sensor_errors is {name!r}; leave one of the two out")
         return cls("offset" in name or "drift" in name, sd > 0.0, "delay" in name, sd)
