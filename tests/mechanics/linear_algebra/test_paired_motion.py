@@ -56,3 +56,4 @@ def test_pairs_move_as_the_whole_matrix_says(condensed: list[int] | None) -> Non
     rows = (3 * nodes[:, None] + np.arange(3)).ravel()
     np.testing.assert_allclose(pairs.under(factors, nodes), (b.T @ np.linalg.inv(matrix))[:, rows], atol=1e-6)
     assert pairs.under(factors, nodes[:0]).shape == (3, 0)
+    assert PairedMotion.of(factors, np.arange(0), NODES[:0], along[:0], HELD).under(factors, nodes).shape == (0, 6)

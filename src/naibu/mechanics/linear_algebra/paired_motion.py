@@ -59,7 +59,7 @@ class PairedMotion:
             motion = factors.solve_all(unit)
             inverse[:, some] = relative(motion, nodes, directions)
             of_condensed[some] = motion.reshape(-1, 3, len(at))[there].transpose(2, 0, 1)
-        return cls(numbers, nodes, directions, inverse, of_condensed.reshape(len(nodes), -1))
+        return cls(numbers, nodes, directions, inverse, of_condensed.reshape(len(nodes), 3 * len(there)))
 
     @classmethod
     def none(cls) -> Self:
