@@ -40,6 +40,7 @@ COMMANDS: dict[str, tuple[str | None, str]] = {
     "cut_strokes": ("cut_strokes.py 4", "cut_strokes.py"),
     "cut_deviation": ("cut_deviation.py 20 2", "cut_deviation.py"),
     "cut_contact": (None, "cut_contact.py"),
+    "crossing_cuts": (None, "crossing_cuts.py --body 15"),
     "large_volumes": (None, "large_volumes.py --sizes 160 256 --in-memory --peers --record"),
     "live_page": (None, "live_page.py --record"),
     "sensing_chip": (None, "sensing_chip.py"),

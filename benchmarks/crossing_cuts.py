@@ -116,7 +116,7 @@ def main() -> None:
     body = replace(body_named(given.body), lips_friction=given.friction, gravity=np.array([0.0, 0.0, -9810.0]))
     compile_for_cuts()
     print(f"{given.body}: {body.mesh.n_cells} cells, {body.mesh.n_points} nodes")
-    for order in ORDERS:
+    for order in [given.order] if given.order else ORDERS:
         print(order)
         cut_in_order(body, order.split())
 

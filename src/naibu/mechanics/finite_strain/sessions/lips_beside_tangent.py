@@ -127,8 +127,8 @@ def changing_lips(lips: CutLips, tangent: EarlierTangent, displacement: FloatArr
     """
     before, after = lips.gaps(displacement), lips.gaps(displacement + free)
     then = tangent.lips.any(axis=(1, 2))
-    known = tangent.factors.covered(lips.pairs).all(axis=1)
-    changed = (then != (before < 0.0)) | (known & (then != (after < 0.0)))
+    known = np.asarray(tangent.factors.covered(lips.pairs).all(axis=1))
+    changed = np.asarray((then != (before < 0.0)) | (known & (then != (after < 0.0))))
     of_approach = approaching(lips, tangent)
     known[of_approach] = changed[of_approach] = False
     close = np.minimum(np.abs(before), np.abs(after)) / lips.edge
@@ -170,7 +170,7 @@ def approaching(lips: CutLips, tangent: EarlierTangent) -> IntArray:
     now = lips.normals
     assert now is not None
     turned = (now[known.numbers] * known.directions).sum(axis=1)
-    return known.numbers[(turned > TURNED) | ~now[known.numbers].any(axis=1)]
+    return np.asarray(known.numbers[(turned > TURNED) | ~now[known.numbers].any(axis=1)])
 
 
 @dataclass(slots=True, eq=False)
@@ -212,7 +212,8 @@ class ApproachingLips:
         earlier = np.einsum("pi,pij,pj->p", known.directions, tangent.lips[known.numbers], known.directions)
         active = np.isin(known.numbers, approaching(lips, tangent))
         assert own.normals is not None
-        along = np.where(own.normals.any(axis=1)[:, None], own.normals, known.directions)
+        facing = np.asarray(own.normals.any(axis=1))
+        along = np.where(facing[:, None], own.normals, known.directions)
         now, then = (np.where(active[:, None], unit, 0.0) for unit in (along, known.directions))
         return cls(own, active, now, then, own.gaps(displacement), earlier)
 
