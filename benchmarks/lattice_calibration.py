@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from records import ResultTable, write_record
 
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
-from naibu.identification.lattice_calibration.captured.sensor_errors import ANY_DRIFT, SensorErrorNames, SensorErrors
+from naibu.identification.lattice_calibration.captured.sensor_errors import LITTLE_DRIFT, SensorErrorNames, SensorErrors
 from naibu.identification.lattice_calibration.evaluation import residuals_at
 from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD
 from naibu.identification.lattice_calibration.study_model import StudyModel
@@ -133,7 +133,7 @@ def problem_of(
     pace: float,
     rng: np.random.Generator,
     divided: int = 1,
-    errors: SensorErrors = ANY_DRIFT,
+    errors: SensorErrors = LITTLE_DRIFT,
     drift: float = 0.0,
 ) -> StudyProblem:
     """Record the truth with steps of time that are shorter than those of the study by `divided`, and set up its identification."""
@@ -169,7 +169,7 @@ def drawn(
     pace: float = 1.0,
     threads: int,
     divided: int = 1,
-    errors: SensorErrors = ANY_DRIFT,
+    errors: SensorErrors = LITTLE_DRIFT,
     drift: float = 0.0,
 ) -> Draw:
     """Calibrate one truth."""
@@ -215,7 +215,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
     parser.add_argument("--divided", type=int, default=1, help="by how much steps of time of the truth are shorter than those of the model")
     parser.add_argument("--sensor-errors", choices=get_args(SensorErrorNames), default="none", help="sought along; the sensor has none")
-    parser.add_argument("--force-drift", type=float, help="standard deviation that is stated, mN/s; by default any drift is counted")
+    parser.add_argument(
+        "--force-drift", type=float, help="standard deviation that is stated, mN/s; by default .5 %% of the largest force a second"
+    )
     parser.add_argument("--drift", type=float, default=0.0, help="that the sensor has along z, mN/s")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1, help="processes, one draw each")

@@ -37,7 +37,9 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=9)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sensor-errors", choices=get_args(SensorErrorNames), default="none", help="sought along; the sensors have none")
-    parser.add_argument("--force-drift", type=float, help="standard deviation that is stated, mN/s; by default any drift is counted")
+    parser.add_argument(
+        "--force-drift", type=float, help="standard deviation that is stated, mN/s; by default .5 %% of the largest force a second"
+    )
     parser.add_argument("--drift", type=float, default=0.0, help="that the sensors have along z, mN/s")
     parser.add_argument("--linearised", action="store_true", help="deviations by derivatives at the truth")
     options = parser.parse_args()

@@ -84,7 +84,7 @@ def calibrate(
         offset), or none.
     force_drift_mn_per_s
         Standard deviation of the drift of a component of a force sensor, mN/s, as from its data sheet; 0 if it has none. By default
-        intervals count any drift since the beginning of a record.
+        0.5 % of the largest force of a record, per second; with --sensor-errors drift any drift is as likely.
     max_runs
         Number of simulations of a search without derivatives, at most.
     seed

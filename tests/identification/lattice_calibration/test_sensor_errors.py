@@ -15,7 +15,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.captured.force_history import SampledMeans
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
-from naibu.identification.lattice_calibration.captured.sensor_errors import ANY_DRIFT, NO_ERRORS, SensorErrors
+from naibu.identification.lattice_calibration.captured.sensor_errors import ANY_DRIFT, LITTLE_DRIFT, NO_ERRORS, SensorErrors
 from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
 from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import diagnosed, sensor_errors_found
 from naibu.identification.lattice_calibration.intervals.unnoticed_drift import counted_drift, unnoticed_drift
@@ -189,7 +189,7 @@ def test_a_drift_that_was_not_sought_is_named_though_parameters_take_up_most_of_
         low, high = found.intervals().T
         assert not ((low < TRUTH) & (high > TRUTH)).all()
         told = diagnosed(made, found)
-        assert told is not None and told.errors == SensorErrors(offset=True, drift=True, delay=True)
+        assert told is not None and told.errors == SensorErrors.named("drift and delay")
         named = {error.quantity: error for error in told.told}
         assert named["drift along z"].value == pytest.approx(100.0, abs=max(4.0 * named["drift along z"].sd, 40.0))
         low, high = told.estimate.intervals().T
@@ -207,7 +207,7 @@ def test_a_drift_that_forces_cannot_exclude_is_told_with_what_it_does(tmp_path: 
     assert moved.noise_factor[1] < 1.2  # nothing that would be noticed
     k = found.unknowns.names.index(told.parameter)
     assert abs(np.log(moved.values[k] / found.values[k])) == pytest.approx(np.log(told.factor), rel=0.35)
-    sought = replace(made, sensor_errors=SensorErrors(offset=True, drift=True, delay=True))
+    sought = replace(made, sensor_errors=SensorErrors.named("drift and delay"))
     assert unnoticed_drift(sought, found) is None
 
 
@@ -244,6 +244,19 @@ def test_intervals_hold_whatever_the_drift_that_nobody_sought(tmp_path: Path, cl
         assert listed["drift along z"].value == pytest.approx(drift, abs=3.5 * listed["drift along z"].sd)
     assert np.abs(deviations).max() < 3.5
     assert (np.abs(deviations) < 1.96).sum() >= 10
+
+
+def test_a_little_drift_of_which_nothing_is_stated_is_counted(tmp_path: Path, clean: FloatArray, times: FloatArray) -> None:
+    """A standard deviation of half a per cent of the largest force a second, as if it were stated."""
+    made = problem(tmp_path, clean, times, 4, LITTLE_DRIFT, drift=30.0)
+    largest = float(np.nanmax(np.linalg.norm(made.load_cases[0].forces.force[:, 1], axis=1)))
+    stated = replace(made, sensor_errors=SensorErrors(drift=True, drift_sd=0.005 * largest))
+    found, same = (calibrate_lattice(each, each.unknowns.start, threads=1) for each in (made, stated))
+    np.testing.assert_allclose(found.values, same.values, rtol=1e-9)
+    deviations = np.log(found.values / TRUTH) / np.sqrt(np.diag(found.covariance))
+    assert np.abs(deviations).max() < 2.5
+    assert unnoticed_drift(stated, same) is None
+    assert sensor_errors_found(made, found) == ()
 
 
 def test_intervals_with_a_drift_are_those_of_least_squares_with_its_prior(tmp_path: Path, clean: FloatArray, times: FloatArray) -> None:
@@ -297,4 +310,5 @@ def test_a_record_too_short_for_errors_of_its_sensor_is_told(tmp_path: Path, cle
         SensorErrors.named("none", -1.0)
     with pytest.raises(InputError, match="leave one of the two out"):
         SensorErrors.named("drift", 0.0)
-    assert SensorErrors.named("none", 0.0) == replace(NO_ERRORS, drift_sd=0.0) and SensorErrors.named("none") == ANY_DRIFT
+    assert SensorErrors.named("none", 0.0) == replace(NO_ERRORS, drift_sd=0.0)
+    assert SensorErrors.named("none") == LITTLE_DRIFT and SensorErrors.named("drift") == replace(ANY_DRIFT, offset=True)

@@ -12,7 +12,6 @@ from lattice_studies import study_file
 from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
-from naibu.identification.lattice_calibration.captured.sensor_errors import NO_ERRORS
 from naibu.identification.lattice_calibration.evaluation import evaluated
 from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD, calibrate_lattice, estimate_at
 from naibu.identification.lattice_calibration.study_model import StudyModel
@@ -160,16 +159,12 @@ def test_shares_of_samples_weigh_the_steps_alike(squeezed: LatticeStudy) -> None
 
 
 def steadily_pushed(study: LatticeStudy) -> StudyProblem:
-    """Return the search for friction of a block that slides steadily: pushed by mu_k m g, by that law alone, not by a simulation.
-
-    The sensor is known not to drift: ten windows tell little beside that law.
-    """
+    """Return the search for friction of a block that slides steadily: pushed by mu_k m g, by that law alone, not by a simulation."""
     times, weight = np.arange(0.2, 0.4, 0.001), 200e-3 * 9810.0
     force = np.column_stack([np.full(len(times), MU * weight), np.zeros((len(times), 2))])
     noisy = force + 5.0 * np.random.default_rng(0).standard_normal(force.shape)
     recorded = RecordedForces.of(study, [(1, times, noisy)], sd_mn=5.0)
-    unknowns = StudyUnknowns.of(study, groups="given", friction="each")
-    return StudyProblem.of(unknowns, [], recorded, point_sd_mm=0.5, sensor_errors=NO_ERRORS)
+    return StudyProblem.of(StudyUnknowns.of(study, groups="given", friction="each"), [], recorded, point_sd_mm=0.5)
 
 
 def test_without_regressions_intervals_in_contact_are_those_of_the_prior(pushed: LatticeStudy) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
-from naibu.identification.lattice_calibration.captured.sensor_errors import ANY_DRIFT, BodyResiduals, SensorErrors, body_residuals
+from naibu.identification.lattice_calibration.captured.sensor_errors import LITTLE_DRIFT, BodyResiduals, SensorErrors, body_residuals
 from naibu.identification.lattice_calibration.captured.shape_distance import checked_points, closest_points
 from naibu.identification.lattice_calibration.forward_model import Reproduced
 from naibu.identification.lattice_calibration.study_model import StudyModel
@@ -64,7 +64,7 @@ class StudyProblem:
     load_cases: tuple[StudyLoadCase, ...]
     point_sd_mm: float
     excess: tuple[float, float] = (1.0, 1.0)
-    sensor_errors: SensorErrors = ANY_DRIFT
+    sensor_errors: SensorErrors = LITTLE_DRIFT
 
     @classmethod
     def of(
@@ -74,7 +74,7 @@ class StudyProblem:
         forces: RecordedForces,
         *,
         point_sd_mm: float,
-        sensor_errors: SensorErrors = ANY_DRIFT,
+        sensor_errors: SensorErrors = LITTLE_DRIFT,
     ) -> StudyProblem:
         """Set up the calibration of the study of the unknowns.
 
@@ -102,10 +102,10 @@ class StudyProblem:
         if not captures and not np.isfinite(forces.force).any():
             raise InputError("there are neither captured points nor recorded forces; give at least one of the two")
         counts = np.isfinite(forces.force).all(axis=2).sum(axis=0)
-        if (few := counts[counts > 0]).size and few.min() <= sensor_errors.steady + int(sensor_errors.delay):
+        if (few := counts[counts > 0]).size and few.min() <= sensor_errors.unknowns + int(sensor_errors.delay):
             raise InputError(
                 f"a record of forces has samples in {few.min()} windows of time only, which cannot tell errors of its sensor as well: set "
-                "sensor_errors to 'none' and force_drift_mn_per_s to 0, or record more"
+                "sensor_errors to 'none', or record more"
             )
         lattice = study.lattice
         hull, reach = surface_of(lattice), float(np.linalg.norm(np.ptp(lattice.points, axis=0)))

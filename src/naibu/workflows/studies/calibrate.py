@@ -124,7 +124,8 @@ def calibrate_study(
         tared), a ``"delay"`` of its clock, a ``"drift"`` (an offset and what grows evenly with time), two of them, or ``"none"``.
     force_drift_mn_per_s : float
         Standard deviation of the drift of a component of a force sensor, mN/s, as from its data sheet; 0 if it has none. Values and
-        intervals count it, whatever `sensor_errors` are; by default any drift since the beginning of a record.
+        intervals count it, whatever `sensor_errors` are; by default 0.5 % of the largest force of the record, per second, and with
+        ``"drift"`` any.
     max_runs : int
         Simulations of a search without derivatives, at most.
     seed : int

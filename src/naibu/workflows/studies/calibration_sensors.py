@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from naibu.identification.lattice_calibration.captured.sensor_errors import MOST_DELAY_S, SensorErrors
+from naibu.identification.lattice_calibration.captured.sensor_errors import MOST_DELAY_S, USUAL_DRIFT, SensorErrors
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import (
     TOLD,
@@ -38,7 +38,7 @@ def sensors_told(problem: StudyProblem, estimate: LatticeEstimate) -> tuple[Latt
     counted = counted_drift(problem, estimate, found) if estimate.finished else None
     if counted and counted.factor > WIDER:
         told += (
-            f"Intervals count any drift of the force sensors that these forces cannot exclude, as creep looks alike: that of "
+            f"Intervals count {_drift(problem.sensor_errors)} of the force sensors, as creep looks alike: that of "
             f"{counted.parameter} is {counted.factor:.2g} times as wide as without one. Where their data sheet says how much the sensors "
             "drift, state it (force_drift_mn_per_s; 0 if they do not).",
         )
@@ -65,9 +65,9 @@ def _warnings(
         )
     if unnoticed:
         found.append(
-            f"Intervals hold if the sensors do not drift: a drift of {1e-3 * unnoticed.drift_mn_per_s:.2g} N/s on {unnoticed.axis} of "
-            f"{unnoticed.body} would hardly show in these forces, as creep looks alike, and would make {unnoticed.parameter} wrong by a "
-            f"factor of {unnoticed.factor:.3g}. Where a sensor may drift so, leave force_drift_mn_per_s out."
+            f"Intervals hold if the sensors {_drifts(problem.sensor_errors)}: a drift of {1e-3 * unnoticed.drift_mn_per_s:.2g} N/s on "
+            f"{unnoticed.axis} of {unnoticed.body} would hardly show in these forces, as creep looks alike, and would make "
+            f"{unnoticed.parameter} wrong by a factor of {unnoticed.factor:.3g}. Where a sensor may drift so, set sensor_errors to 'drift'."
         )
     for error in sensors:
         if abs(error.value) > TOLD * error.sd and _matters(problem, error):
@@ -79,6 +79,16 @@ def _warnings(
                 "do not rely on these values."
             )
     return tuple(found)
+
+
+def _drift(errors: SensorErrors) -> str:
+    if errors.drift_sd is None:
+        return f"a drift by some {100.0 * USUAL_DRIFT:g} % of the largest force a second (standard deviation)"
+    return "any drift" if errors.any_drift else f"a drift by {1e-3 * errors.drift_sd:.3g} N/s (standard deviation)"
+
+
+def _drifts(errors: SensorErrors) -> str:
+    return f"drift by less than {200.0 * USUAL_DRIFT:g} % of the largest force a second" if errors.drift else "do not drift"
 
 
 def sensor_section(sensors: Sequence[SensorError]) -> tuple[Section, ...]:
@@ -106,7 +116,7 @@ def _matters(problem: StudyProblem, error: SensorError) -> bool:
 
 
 def _perhaps(problem: StudyProblem, errors: SensorErrors) -> str:
-    drifts = errors.drift and not problem.sensor_errors.drift
+    drifts = errors.any_drift and not problem.sensor_errors.any_drift
     told = [("a sensor was perhaps not tared", errors.offset and not drifts), ("a sensor perhaps drifts", drifts)]
     told.append(("its clock is perhaps off", errors.delay))
     return ", and ".join(text for text, holds in told if holds)
@@ -114,5 +124,5 @@ def _perhaps(problem: StudyProblem, errors: SensorErrors) -> str:
 
 def _name(problem: StudyProblem, errors: SensorErrors) -> str:
     """Return what errors go by; a drift that is counted in any case needs no name."""
-    steady = "drift" if errors.drift and not problem.sensor_errors.drift else "offset" if errors.offset else ""
+    steady = "drift" if errors.any_drift and not problem.sensor_errors.any_drift else "offset" if errors.offset else ""
     return " and ".join(part for part in (steady, "delay" if errors.delay else "") if part)

@@ -25,6 +25,7 @@ MOST_DELAY_S = 0.2  # either way
 DELAY_SD_S = 0.2  # weak prior, where forces hardly change
 EXACT_S = 1e-7
 LARGEST_DRIFT = 1e6  # mN/s, of those that are stated
+USUAL_DRIFT = 0.005  # of the largest force of a record, 1/s: standard deviation of a drift of which nothing is stated; load cells have less
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,18 +42,19 @@ class SensorErrors:
         to be none, intervals hold only with it.
     delay : bool
         The clock of each record is late or early, by up to `MOST_DELAY_S`.
-    drift_sd : float
-        Standard deviation of the drift of a component, mN/s, known beforehand (of a data sheet); by default any drift is as likely.
+    drift_sd : float, optional
+        Standard deviation of the drift of a component, mN/s, known beforehand (of a data sheet), or infinite: any drift is as likely. By
+        default it is `USUAL_DRIFT` of the largest force of the record, per second.
     """
 
     offset: bool = False
     drift: bool = False
     delay: bool = False
-    drift_sd: float = np.inf
+    drift_sd: float | None = None
 
     @classmethod
     def named(cls, name: SensorErrorNames, drift_sd: float | None = None) -> SensorErrors:
-        """Return those that go by a name; a drift has an offset. All have a drift unless its standard deviation, mN/s, is 0.
+        """Return those that go by a name; a drift that does has an offset. All have a drift unless its standard deviation, mN/s, is 0.
 
         Raises
         ------
@@ -61,12 +63,12 @@ class SensorErrors:
         """
         if name not in get_args(SensorErrorNames):
             raise InputError(f"sensor_errors is {name!r}; choose one of {', '.join(get_args(SensorErrorNames))}")
-        sd = np.inf if drift_sd is None else drift_sd
-        if drift_sd is not None and not 0.0 <= sd <= LARGEST_DRIFT:
-            raise InputError(f"force_drift_mn_per_s is {sd:g}: must be between 0 and {LARGEST_DRIFT:g} mN/s; leave it out if unknown")
+        sd = np.inf if drift_sd is None and "drift" in name else drift_sd
+        if drift_sd is not None and not 0.0 <= drift_sd <= LARGEST_DRIFT:
+            raise InputError(f"force_drift_mn_per_s is {drift_sd:g}: must be between 0 and {LARGEST_DRIFT:g} mN/s; leave it out if unknown")
         if "drift" in name and sd == 0.0:
             raise InputError(f"force_drift_mn_per_s is 0, but sensor_errors is {name!r}; leave one of the two out")
-        return cls("offset" in name or "drift" in name, sd > 0.0, "delay" in name, sd)
+        return cls("offset" in name or "drift" in name, sd != 0.0, "delay" in name, sd)
 
     @property
     def any(self) -> bool:
@@ -76,6 +78,16 @@ class SensorErrors:
     def holds(self, other: SensorErrors) -> bool:
         """Return whether all of another one are among these."""
         return self.offset >= other.offset and self.drift >= other.drift and self.delay >= other.delay
+
+    @property
+    def any_drift(self) -> bool:
+        """Whether any drift is as likely."""
+        return self.drift and self.drift_sd == np.inf
+
+    @property
+    def unknowns(self) -> int:
+        """How many numbers of each component nothing is known of."""
+        return int(self.offset) + int(self.any_drift)
 
     @property
     def steady(self) -> int:
@@ -90,7 +102,7 @@ class SensorErrors:
         return np.stack(columns, axis=1) if columns else np.zeros((len(times), 0))
 
 
-NO_ERRORS, ANY_DRIFT = SensorErrors(), SensorErrors(drift=True)
+NO_ERRORS, LITTLE_DRIFT, ANY_DRIFT = SensorErrors(), SensorErrors(drift=True), SensorErrors(drift=True, drift_sd=np.inf)
 SensorErrorNames = Literal["none", "offset", "delay", "offset and delay", "drift", "drift and delay"]
 
 
@@ -169,7 +181,9 @@ def body_residuals(
     design = errors.functions(np.asarray(since, dtype=np.float64))
     basis, upper = np.linalg.qr(weight * design)
     # a normal prior of the last coefficient makes noise larger along the last direction: rows are in units of that noise
-    known = np.abs(upper[-1:, -1:].ravel()) * errors.drift_sd if errors.drift else np.zeros(0)
+    largest = float(np.linalg.norm(seen[counted], axis=1).max(initial=0.0))
+    drift_sd = USUAL_DRIFT * largest if errors.drift_sd is None else errors.drift_sd
+    known = np.abs(upper[-1:, -1:].ravel()) * drift_sd if errors.drift else np.zeros(0)
     taken = np.ones(basis.shape[1])
     taken[len(taken) - len(known) :] = 1.0 - 1.0 / np.sqrt(1.0 + known**2)
     shrunk = taken * (2.0 - taken)  # of coefficients along these directions, 1 without a prior

@@ -17,7 +17,9 @@ from naibu.identification.lattice_calibration.intervals.model_errors import MISF
 from naibu.identification.lattice_calibration.least_squares import about, unsettled_covariance
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 
-CANDIDATES = tuple(SensorErrors(*map(bool, each)) for each in ((1, 0, 0), (0, 0, 1), (1, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1)))
+CANDIDATES = tuple(
+    SensorErrors(*map(bool, each), drift_sd=np.inf) for each in ((1, 0, 0), (0, 0, 1), (1, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1))
+)
 CHANCE = 0.05  # of an F-test, below which errors are told
 MOVES = 0.5  # standard deviations by which an estimate must move, or its standard deviation grow, for errors to be told
 EXPLAINED = 0.25  # of what the mean square of residuals is above that of noise, from which on errors are told
@@ -81,10 +83,11 @@ def sensor_errors_found(problem: StudyProblem, estimate: LatticeEstimate, found:
     """Return the errors of all sensors at the values of an estimate, as far as the problem seeks them.
 
     Standard deviations count as well what steps of time leave: twice what errors differ by with half steps (:cite:t:`richardson1911`).
-    In contact, where derivatives take a simulation each, a drift alone is not listed. `found` is what `at_estimate` returns, if known.
+    A drift alone is not listed of which nothing is stated, or in contact, where derivatives take a simulation each. `found` is what
+    `at_estimate` returns, if known.
     """
     errors = problem.sensor_errors
-    asked = errors.offset or errors.delay or (errors.drift and problem.roughness == 0.0)
+    asked = errors.offset or errors.delay or (errors.drift and errors.drift_sd is not None and problem.roughness == 0.0)
     if not asked or not len(problem.load_cases[0].forces.force):
         return ()
     listed = _listed(problem, found or at_estimate(problem, estimate), estimate.covariance, max(estimate.noise_factor[1], 1.0) ** 2)
@@ -114,7 +117,7 @@ def diagnosed(problem: StudyProblem, estimate: LatticeEstimate, found: Reproduce
         return None
     fits = []
     for errors in CANDIDATES:
-        errors = replace(errors, drift_sd=problem.sensor_errors.drift_sd) if problem.sensor_errors.drift else errors
+        errors = _beside(problem.sensor_errors, errors)
         after = fitted(replace(problem, sensor_errors=errors), found)
         more, free = after.unknowns - before.unknowns, max(count - after.unknowns, 1)
         if more > 0 and errors.holds(problem.sensor_errors):
@@ -149,6 +152,13 @@ class LinearFit:
     unknowns: int
 
 
+def _beside(sought: SensorErrors, errors: SensorErrors) -> SensorErrors:
+    """Return errors with what is known of a drift that is counted in any case; of one of which nothing is stated, any is tried."""
+    if not sought.drift or (errors.drift and sought.drift_sd is None):
+        return errors
+    return replace(errors, drift=errors.drift or sought.drift_sd is None, drift_sd=sought.drift_sd)
+
+
 def at_estimate(problem: StudyProblem, estimate: LatticeEstimate) -> Reproduced:
     """Return shapes and forces at an estimate, of fine steps, with derivatives."""
     unknowns = problem.unknowns
@@ -164,7 +174,7 @@ def fitted(problem: StudyProblem, found: Reproduced) -> LinearFit:
     covariance = np.asarray(np.linalg.inv(slopes.T @ slopes))
     step = -covariance @ (of_points.T @ points / factor**2 + of_forces.T @ forces)
     bodies, errors = int(np.isfinite(case.forces.force).any(axis=(0, 2)).sum()), problem.sensor_errors
-    unknowns = len(step) + bodies * (3 * errors.steady + int(errors.delay))
+    unknowns = len(step) + bodies * (3 * errors.unknowns + int(errors.delay))
     return LinearFit(float(((forces + of_forces @ step) ** 2).sum()), step, covariance, unknowns)
 
 

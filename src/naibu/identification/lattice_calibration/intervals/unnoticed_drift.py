@@ -1,4 +1,4 @@
-"""A drift of force sensors that forces do not show: what it does where it is said not to be there, and to intervals that count it."""
+"""A drift of force sensors that forces do not show: what one beyond those that are counted would do, and what counting them costs."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ class UnnoticedDrift:
 
 
 def unnoticed_drift(problem: StudyProblem, estimate: LatticeEstimate, found: Reproduced | None = None) -> UnnoticedDrift | None:
-    """Return the drift, said not to be there, that forces cannot exclude and that moves a value farthest beyond its interval, if any does.
+    """Return the drift that forces cannot exclude and that moves a value farthest beyond its interval; none where one is stated.
 
     Creep of a viscoelastic object looks alike: parameters take up a drift, no misfit is left, and nothing in the data tells that their
     intervals do not hold. None in contact, where derivatives are differences that take up anything. `found` is what `at_estimate`
     returns, if known.
     """
     forces, sought = problem.load_cases[0].forces, problem.sensor_errors
-    if sought.drift or problem.roughness > 0.0 or not len(forces.force):
+    if (sought.drift and sought.drift_sd is not None) or problem.roughness > 0.0 or not len(forces.force):
         return None
     drifting = replace(problem, sensor_errors=replace(sought, offset=True, drift=True, drift_sd=np.inf))
     found = found or at_estimate(problem, estimate)
