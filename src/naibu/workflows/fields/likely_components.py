@@ -30,8 +30,8 @@ def require_likely_components(
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Refuse fields that suit an elastic body far better with their components in another order or of other signs.
 
-    Where forces may act on the whole surface, what tells is that bodies hardly change their volume, unless a zone is known that may. An
-    order that is only doubtful is told.
+    Where forces may act on the whole surface, what tells is that bodies hardly change their volume, unless a zone is known that may. As
+    lungs and foams do, too, that is a doubt, which is told.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def require_likely_components(
     for case in cubes.load_cases:
         changed = volume_change(cubes.mesh, case)
         if changed.wrong_sign and not compressible:
-            raise InputError(f"{case.name}: {told_sign(changed)}")
-        if changed.doubtful_order and not compressible:
+            doubts.append(f"{case.name}: {told_sign(changed)}")
+        elif changed.doubtful_order and not compressible:
             doubts.append(f"{case.name}: {told_doubt(changed)}")
         elif not changed.signs_told:
             untold.append(UNTOLD.format(case.name, changed.given, "xyz"[changed.component], changed.flipped))
@@ -79,10 +79,10 @@ def told_sign(found: VolumeChange) -> str:
     """Return in words that the sign of a component is likely wrong, and what to do."""
     others = " and ".join(f"u{axis}" for k, axis in enumerate("xyz") if k != found.component)
     return (
-        f"the volume changes {_times(found.given)} as much as the shape, as it does in no gel or tissue; with another sign of "
-        f"u{'xyz'[found.component]} it would change {_times(found.flipped)} as much. Components are likely not in the frame of the "
-        f"positions: change the sign of u{'xyz'[found.component]}, or else of {others}. If they are right, as of a foam that is squeezed "
-        "from several sides, state a zone of it as known with its Poisson's ratio, or give check_components=False"
+        f"the volume changes {_times(found.given)} as much as the shape, and would change {_times(found.flipped)} as much with another "
+        f"sign of u{'xyz'[found.component]}. That is right of a lung, sponge or foam that expands or is squeezed in several directions; of "
+        f"a gel or other tissue, components are not in the frame of the positions: change the sign of u{'xyz'[found.component]}, or else "
+        f"of {others}."
     )
 
 

@@ -35,12 +35,13 @@ def sensors_told(problem: StudyProblem, estimate: LatticeEstimate) -> tuple[Latt
     estimate = diagnosis.estimate if diagnosis else estimate
     sensors = sensor_errors_found(problem, estimate, found)
     told = _warnings(problem, diagnosis, sensors, unnoticed)
-    counted = counted_drift(problem, estimate, found) if estimate.finished else None
+    unstated = problem.sensor_errors.drift_sd is None
+    counted = counted_drift(problem, estimate, found) if estimate.finished and unstated else None
     if counted and counted.factor > WIDER:
         told += (
-            f"Intervals count {_drift(problem.sensor_errors)} of the force sensors, as creep looks alike: that of "
-            f"{counted.parameter} is {counted.factor:.2g} times as wide as without one. Where their data sheet says how much the sensors "
-            "drift, state it (force_drift_mn_per_s; 0 if they do not).",
+            f"Intervals count a drift of the force sensors by some {100.0 * USUAL_DRIFT:g} % of their largest force a second, as creep "
+            f"looks alike: that of {counted.parameter} is {counted.factor:.2g} times as wide as without one. Where their data sheet says "
+            "how much the sensors drift, state it (force_drift_mn_per_s; 0 if they do not).",
         )
     return estimate, sensors, told
 
@@ -79,12 +80,6 @@ def _warnings(
                 "do not rely on these values."
             )
     return tuple(found)
-
-
-def _drift(errors: SensorErrors) -> str:
-    if errors.drift_sd is None:
-        return f"a drift by some {100.0 * USUAL_DRIFT:g} % of the largest force a second (standard deviation)"
-    return "any drift" if errors.any_drift else f"a drift by {1e-3 * errors.drift_sd:.3g} N/s (standard deviation)"
 
 
 def _drifts(errors: SensorErrors) -> str:

@@ -5,9 +5,9 @@ tissue and gels hardly change their volume. With the sign of one component chang
 volume then seems to change by as much as the shape. The gradient of the displacement is that of the nearest one that is interpolated in
 cells, found without any mechanics, and the volume is that of finite strain.
 
-Two readings are left open. Reversed displacements change volume by second orders of strain alone, as a Poisson's ratio somewhat below 0.5
-does. And with components in another order a body that is squeezed, a sponge between plates, is one that is sheared: fields of either may be
-right, so that the order is only doubted.
+It is no proof: lungs and foams change their volume as well. Two readings are left open besides. Reversed displacements change volume by
+second orders of strain alone, as a Poisson's ratio somewhat below 0.5 does. And with components in another order a body that is squeezed, a
+sponge between plates, is one that is sheared: fields of either may be right.
 """
 
 from __future__ import annotations
