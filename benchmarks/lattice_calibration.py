@@ -215,9 +215,7 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0, help="seed of the first draw")
     parser.add_argument("--divided", type=int, default=1, help="by how much steps of time of the truth are shorter than those of the model")
     parser.add_argument("--sensor-errors", choices=get_args(SensorErrorNames), default="none", help="sought along; the sensor has none")
-    parser.add_argument(
-        "--force-drift", type=float, help="standard deviation that is stated, mN/s; by default .5 %% of the largest force a second"
-    )
+    parser.add_argument("--force-drift", type=float, help="standard deviation that is stated, mN/s; by default that of naibu calibrate")
     parser.add_argument("--drift", type=float, default=0.0, help="that the sensor has along z, mN/s")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--workers", type=int, default=1, help="processes, one draw each")

@@ -18,7 +18,8 @@ from naibu.identification.lattice_calibration.least_squares import about, unsett
 from naibu.identification.lattice_calibration.study_problem import StudyProblem
 
 CANDIDATES = tuple(
-    SensorErrors(*map(bool, each), drift_sd=np.inf) for each in ((1, 0, 0), (0, 0, 1), (1, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1))
+    SensorErrors(bool(offset), bool(drift), bool(delay), np.inf)
+    for offset, drift, delay in ((1, 0, 0), (0, 0, 1), (1, 0, 1), (1, 1, 0), (0, 1, 1), (1, 1, 1))
 )
 CHANCE = 0.05  # of an F-test, below which errors are told
 MOVES = 0.5  # standard deviations by which an estimate must move, or its standard deviation grow, for errors to be told
