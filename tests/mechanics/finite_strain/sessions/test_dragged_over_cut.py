@@ -114,9 +114,9 @@ def fast() -> Dragged:
     return dragged(RealTimeEngine)
 
 
-@pytest.mark.parametrize(("name", "left"), [("exact", 0.02), ("fast", 0.05)])
+@pytest.mark.parametrize(("name", "left", "divided"), [("exact", 0.02, 0.02), ("fast", 0.05, 0.15)])
 def test_momentum_is_balanced_no_element_inverts_and_no_energy_comes_from_nothing(
-    name: str, left: float, exact: Dragged, request: pytest.FixtureRequest
+    name: str, left: float, divided: float, exact: Dragged, request: pytest.FixtureRequest
 ) -> None:
     """Steps in real time may leave something to the next ones, and tell how much.
 
@@ -126,7 +126,7 @@ def test_momentum_is_balanced_no_element_inverts_and_no_energy_comes_from_nothin
     most = np.linalg.norm(found.force, axis=1).max()
     unbalanced = np.linalg.norm(found.balance, axis=1)
     assert unbalanced[exact.whole].max() < left * most
-    assert unbalanced[~exact.whole].max(initial=0.0) < 3.0 * left * most
+    assert unbalanced[~exact.whole].max(initial=0.0) < divided * most
     assert np.median(np.linalg.norm(found.balance, axis=1)) < 0.002 * most
     assert found.volume > 0.2
     assert max(found.closed) > 4  # the sides touch under the ball
@@ -141,7 +141,7 @@ def test_in_real_time_the_force_is_that_of_newtons_method_without_a_step_of_it(e
     assert isinstance(fast.session, RealTimeSession) and fast.session.newton_steps == 0
     apart = np.linalg.norm(fast.force - exact.force, axis=1) / np.linalg.norm(exact.force, axis=1).max()
     # most where the ball leaves, and little of the force is left; where Newton's method takes parts of a step, its force is their mean
-    assert apart[exact.whole].max() < 0.1 and np.quantile(apart, 0.9) < 0.02 and np.count_nonzero(~exact.whole) < 6
+    assert apart.max() < 0.2 and apart[exact.whole].max() < 0.1 and np.quantile(apart, 0.9) < 0.02 and np.count_nonzero(~exact.whole) < 6
     assert fast.whole.all()
     there, back = fast.force[12:42, 1], fast.force[42:72, 1]
     assert back[-1] < 0.0 < there[-1]  # it drags the body along
