@@ -26,9 +26,9 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
     "sphinxcontrib.bibtex",
+    "accessibility",
     "benchmark_plots",
     "benchmark_results",
-    "heading_levels",
     "naibu_help",
     "public_names",
 ]
