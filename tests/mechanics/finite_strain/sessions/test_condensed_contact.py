@@ -23,6 +23,8 @@ BODY, WALL, GAP = 10.0, 1e4, 0.5  # mN/mm, mN/mm, mm
 class Wall:
     """A wall across z, at a gap above all nodes, that pushes and does not pull."""
 
+    slips = False
+
     def __init__(self) -> None:
         self.deep, self.exerted = np.zeros(0), 0.0
 
@@ -31,7 +33,8 @@ class Wall:
         self.exerted = WALL * float(self.deep.sum())
         return np.column_stack([np.zeros((len(motion), 2)), -WALL * self.deep])
 
-    def change(self) -> BlockChange:
+    def change(self, *, exact: bool = False) -> BlockChange:
+        assert not exact
         nodes = np.flatnonzero(self.deep > 0.0)
         places = np.arange(len(nodes))
         return BlockChange(nodes, places, places, np.tile(WALL * np.diag([0.0, 0.0, 1.0]), (len(nodes), 1, 1)))
@@ -43,6 +46,8 @@ class Wall:
 
 class RoughWall:
     """A wall across z at z = 0 with Coulomb friction: tangential penalties up to a limit that grows with the pressure."""
+
+    slips = True
 
     def __init__(self, friction: float, tangential: float) -> None:
         self.friction, self.tangential, self.changes, self.last, self.exerted = friction, tangential, 0, np.zeros((0, 3)), 0.0
@@ -57,7 +62,7 @@ class RoughWall:
         self.exerted = float(np.abs(force).sum())
         return force
 
-    def change(self) -> BlockChange:
+    def change(self, *, exact: bool = False) -> BlockChange:
         self.changes += 1
         nodes = np.flatnonzero(self.last[:, 2] > 0.0)
         blocks = np.zeros((len(nodes), 3, 3))
@@ -67,7 +72,8 @@ class RoughWall:
             block[2, 2] = WALL
             block[:2, :2] = self.tangential * np.eye(2)
             if self.tangential * size > limit:
-                block[:2, :2] = limit / size * np.eye(2)
+                along = np.outer(motion[:2], motion[:2]) / size**2 if exact else 0.0
+                block[:2, :2] = limit / size * (np.eye(2) - along)
                 block[:2, 2] = self.friction * WALL * motion[:2] / size
         places = np.arange(len(nodes))
         return BlockChange(nodes, places, places, blocks)
@@ -214,7 +220,7 @@ class SoftWall(Wall):
         self.exerted = WALL * float(ramp.sum())
         return np.column_stack([np.zeros((len(motion), 2)), -WALL * ramp])
 
-    def change(self) -> BlockChange:
+    def change(self, *, exact: bool = False) -> BlockChange:
         nodes = np.flatnonzero(self.deep > 0.0)
         slope = WALL * np.minimum(self.deep[nodes] / self.RAMP, 1.0)
         places = np.arange(len(nodes))
@@ -236,6 +242,8 @@ def test_light_contact_is_balanced_as_well_as_heavy_contact(pressed: float) -> N
 class Sides:
     """Pairs that resist their approach beyond a gap, in rows of three."""
 
+    slips = False
+
     def __init__(self, gap: FloatArray) -> None:
         self.gap, self.deep, self.exerted = gap, np.zeros_like(gap), 0.0
 
@@ -244,7 +252,7 @@ class Sides:
         self.exerted = WALL * float(self.deep.sum())
         return WALL * self.deep
 
-    def change(self) -> BlockChange:
+    def change(self, *, exact: bool = False) -> BlockChange:
         rows = np.flatnonzero((self.deep > 0.0).any(axis=1))
         places = np.arange(len(rows))
         return BlockChange(rows, places, places, WALL * (self.deep[rows] > 0.0)[:, :, None] * np.eye(3))

@@ -8,7 +8,8 @@ size of the body. Contacts that open, close, stick or slip cost no iteration of 
 The derivative of Coulomb friction vanishes along the direction of slip. Steps of Newton's method are far too long where points begin or
 cease to slip, and points stick and slip by turns. With the secant of the friction instead, the force over the elastic slip, every step
 reduces the energy of friction of a known limit (Kacanov's method :cite:p:`han1997`). One such matrix serves for many steps, which
-Anderson's acceleration mixes :cite:p:`walker2011`.
+Anderson's acceleration mixes :cite:p:`walker2011`. Near its end, where no point changes between sticking and slipping any more, these steps
+creep, and those of Newton's method with the derivative itself end the search.
 
 The tangent of a compressed body may be indefinite without the contact that held its surface. Where that contact slips or opens, and the
 body has moved on, such a tangent has no equilibrium nearby, and forces grow without bound. Springs as stiff as the elements then hold the
@@ -19,7 +20,7 @@ none; where that does not succeed, the iterations of the whole body take up what
 from __future__ import annotations
 
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -27,12 +28,9 @@ import numpy as np
 import scipy.linalg as la
 from numpy.typing import NDArray
 
-from naibu.core.arrays import FloatArray, Int32Array, IntArray
-from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, add_earlier_forces, contact_change
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, LipsBesideTangent, change_in_threes, in_threes
+from naibu.core.arrays import FloatArray, IntArray
+from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
-from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse
 
 EVALUATIONS = 60  # of the contact at most
@@ -45,6 +43,7 @@ DEPTH = 6  # earlier steps with a matrix that are mixed
 TRIAL = 3  # steps with a matrix before it is judged: where a point closes, what is left grows before it vanishes
 SLOW = 0.7  # of what was left: mean progress of a step from which another matrix is worth while
 JUMP = 3.0  # growth of what is left from which it is at once
+CLOSE = 3.0  # times the tolerance: what may be left where a matrix has the derivative of friction instead of its secant
 USUAL = 6  # evaluations after which ten times the tolerance is enough
 BALANCED = 0.003  # of the forces: how much those of the motion that they lead to may differ, where hardly any motion is left
 DOWNHILL = 2  # times as many matrices where steps end when the forces that are left do no more work
@@ -65,11 +64,15 @@ class ContactLaw(Protocol):
 
     exerted: float
 
+    @property
+    def slips(self) -> bool:
+        """Whether `change` contains a secant of friction that its exact derivative does not."""
+
     def __call__(self, motion: FloatArray) -> FloatArray:
         """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
 
-    def change(self) -> BlockChange:
-        """Return minus the derivative of the forces at the last motion, with the secant of friction along the slip.
+    def change(self, *, exact: bool = False) -> BlockChange:
+        """Return minus the derivative of the forces at the last motion, with the secant of friction along the slip, or `exact` without it.
 
         Its nodes are places among the k.
         """
@@ -238,7 +241,7 @@ class _Search:
             body._changed, body._held_by = None, body._share
         at = best = begun = self._tried(begin)
         evaluations, changes, steps, cut_short, mixing = 1, 0, 0, 0, AndersonMixing(DEPTH)
-        useless = body._changed is None
+        useless, exact, slips = body._changed is None, False, law.slips
         while evaluations < EVALUATIONS:
             if at.size <= self.tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, BALANCED):
                 return at, True
@@ -251,7 +254,8 @@ class _Search:
                     break
                 yield
                 law(at.motion)  # its last motion may be another
-                change = law.change().with_springs(self._springs)
+                exact = slips and at.size <= CLOSE * self.tolerance_mm
+                change = law.change(exact=exact).with_springs(self._springs)
                 body._changed, changes = ChangedInverse.of(body._inverse, change), changes + 1
                 begun, steps, mixing = at, 0, AndersonMixing(DEPTH)
             step = mixing.step(at.motion.ravel(), -body._changed.solve(at.left).ravel()).reshape(-1, 3)
@@ -262,7 +266,10 @@ class _Search:
             if mixing.steps > 1 and at.size > JUMP * before.size:
                 at, mixing = before, AndersonMixing(DEPTH)
             slow = steps >= TRIAL and at.size > SLOW**steps * begun.size
+            slow |= slips and not exact and SLOW * before.size < at.size <= CLOSE * self.tolerance_mm
             useless = slow or share < 1.0 or at.size > JUMP * begun.size
+            if exact and useless:  # points begin or cease to slip after all
+                at, slips = best, False
             if at.size < best.size:
                 best = at
         return best, False
@@ -360,85 +367,3 @@ class _Motion:
     size: float
     exerted: float
     apart: float = np.nan
-
-
-@dataclass(slots=True, eq=False)
-class ContactBesideTangent:
-    """Forces of contacts beside those that an earlier tangent contains: a `ContactLaw`.
-
-    Attributes
-    ----------
-    nodes : ndarray, shape (k,), int64
-        The nodes concerned.
-    displacement : ndarray, shape (n, 3)
-        From which they move, mm.
-    contacts : sequence of NearbyContact or LipsBesideTangent
-        With points of these nodes only.
-    places : sequence of ndarray
-        Of all points, or pairs, of every contact in the pattern of the surface.
-    pattern : BlockPattern
-        Of the surface.
-    tangent : EarlierTangent
-        With its contacts.
-    sides : ApproachingLips, optional
-        Pairs of the sides of cuts whose approach is condensed, in rows of three behind the nodes.
-    """
-
-    nodes: IntArray
-    displacement: FloatArray
-    contacts: Sequence[NearbyContact | LipsBesideTangent]
-    places: Sequence[Int32Array]
-    pattern: BlockPattern
-    tangent: EarlierTangent
-    sides: ApproachingLips | None = None
-    exerted: float = field(init=False, default=0.0)
-    _place: IntArray = field(init=False)
-    _there: FloatArray = field(init=False)  # displacements (l, 3) of the nodes and, behind them, of others of contacts, which do not move
-    _indenters: list[NearbyContact] = field(init=False)  # with points of nodes in this order
-    _lips: list[LipsBesideTangent] = field(init=False)
-
-    def __post_init__(self) -> None:
-        self._place = np.full(len(self.displacement), -1, dtype=np.int64)
-        self._place[self.nodes] = np.arange(len(self.nodes))
-        own = [c.contact.nodes if isinstance(c, NearbyContact) else c.lips.pairs for c in self.contacts]
-        concerned = np.unique(np.concatenate([np.zeros(0, np.int64), *(nodes.ravel() for nodes in own)]))
-        order = np.concatenate([self.nodes, concerned[self._place[concerned] < 0]])
-        number = np.empty(len(self.displacement), dtype=np.int64)
-        number[order] = np.arange(len(order))
-        self._there = self.displacement[order]
-        self._indenters = [c.numbered(number) for c in self.contacts if isinstance(c, NearbyContact)]
-        self._lips = [c.numbered(number) for c in self.contacts if isinstance(c, LipsBesideTangent)]
-
-    def __call__(self, motion: FloatArray) -> FloatArray:
-        """Return the forces (k, 3), mN, at a motion (k, 3), mm."""
-        count, moved, force, own = len(self.nodes), self._there.copy(), np.zeros_like(self._there), np.zeros_like(self._there)
-        motion, behind = motion[:count], motion[count:]
-        moved[:count] += motion
-        pattern = self.pattern
-        add_earlier_forces(pattern.indptr, pattern.indices, self.tangent.contact, self.nodes, self._place, motion, force)
-        for contact in self._indenters:
-            contact.add_force(moved, own)
-        for lips in self._lips:
-            lips.add_force(moved, force)
-        self.exerted = float(np.abs(own).sum()) + sum(lips.exerted for lips in self._lips)
-        if self.sides is None:
-            return np.asarray((force + own)[:count])
-        across = in_threes(self.sides.forces(behind.ravel()[: len(self.sides.gap)]))
-        self.exerted += self.sides.exerted
-        return np.concatenate([(force + own)[:count], across])
-
-    def change(self) -> BlockChange:
-        """Return the stiffness at the last motion; see `ContactLaw`."""
-        blocks = np.zeros((self.pattern.n_blocks, 3, 3))
-        numbered: list[NearbyContact | LipsBesideTangent] = [*self._indenters, *self._lips]
-        for contact, places in zip(numbered, self.places, strict=True):
-            contact.touching().add_secant_stiffness(self.pattern, places, blocks)
-        return self._beside(blocks, self.sides.change() if self.sides else None)
-
-    def opened(self) -> BlockChange:
-        """Return minus the stiffness of the contacts that the tangent contains; see `ContactLaw`."""
-        return self._beside(np.zeros((self.pattern.n_blocks, 3, 3)), self.sides.opened() if self.sides else None)
-
-    def _beside(self, blocks: FloatArray, across: FloatArray | None) -> BlockChange:
-        change = contact_change(self.pattern, blocks, self.tangent, self.nodes, self._place)
-        return change if across is None else change.and_also(change_in_threes(across, len(self.nodes)))

@@ -23,7 +23,8 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
-from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, UNAIDED, CondensedContact, ContactBesideTangent
+from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, UNAIDED, CondensedContact
+from naibu.mechanics.finite_strain.sessions.contact_beside_tangent import ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.divided_session import DividedSession
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
