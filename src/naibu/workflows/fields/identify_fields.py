@@ -45,6 +45,7 @@ from naibu.workflows.fields.block_mesh import (
     names_of_labels,
     sizes_of_voxels,
 )
+from naibu.workflows.fields.cells_of_map import cubes_of_map
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
 from naibu.workflows.fields.likely_components import require_likely_components
 from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, placed_on_scan, relative_deformation
@@ -59,8 +60,6 @@ if TYPE_CHECKING:
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
 NO_VALUE = np.nan, 0.0, np.inf, np.nan, -1.0, 0.5  # Young's modulus, Poisson's ratio, and their bounds, of a zone that is left out
-CELLS_OF_MAP = 2500  # of the model by default, where points are as many: finer cells than these are apart show nothing more
-LEAST_OF_MAP = 700  # cells, since maps of some hundred are searched with the whole Hessian, which takes longer
 POINTS_OF_CELL, LEAST_CELLS = 2, 64  # cells with fewer points leave to the motion of the surface what zones of uniform moduli would tell
 
 
@@ -173,7 +172,8 @@ def identify_fields(
     element_size_mm : float
         Edge length of the cubes; 0 chooses it so that there are about 1200; fewer where a cell would hold less than two points, more where
         a zone would share less than three quarters with its cubes, or where their size leaves more in doubt of moduli than the measurement
-        does (then up to 2800). Of a map there are as many as points, but 700 at least and 2500 at most.
+        does (then up to 2800). Of a map there are as many as points, but 700 at least and 2500 at most, and fewer where noise would strain
+        them by more than half of what loads do.
     unit, spacing_mm : str, sequence of float, optional
         Unit of fields that do not state theirs, or the size of a voxel along x, y, z, mm, of fields in voxels (see `naibu.io.read_field`).
     node_spacing : sequence of float, optional
@@ -208,14 +208,17 @@ def identify_fields(
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     scanned = ScannedObject(inside, labels, names, tuple((Path(p).stem, f) for p, f in zip(paths, read, strict=True)), tuple(loaded))
     points = max(int(field.valid.sum()) for field in read)
-    usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points)) if each_cell else max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS)
+    usual = max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS)
     size = element_size_mm or scanned.edge_mm(usual)
     sought = () if each_cell else set(names.values()) - set(stated.values)
     if not each_cell:
         scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0, known=stated.not_rigid)
         sought, stated = set(sought) & set(scanned.names.values()), stated.without(set(names.values()) - set(scanned.names.values()))
         size = element_size_mm or scanned.edge_mm(usual)
-    cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
+    if each_cell and not element_size_mm:
+        cubes, longer = cubes_of_map(scanned, points)
+    else:
+        cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     doubts, untold = require_likely_components(scanned, points, stated, progress) if check_components else ((), ())
     if stated is NOTHING_KNOWN:

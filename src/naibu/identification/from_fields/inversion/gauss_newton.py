@@ -116,7 +116,7 @@ class SearchSettings:
     max_iterations : int
         Gauss-Newton iterations.
     tolerance : float
-        The search ends when a step promises to lower the objective by less than this fraction of it.
+        The search ends when a step promises to lower the objective by less than this fraction of it, or lowers it by less.
     settled, nearly : float
         It also ends when moduli would move by fewer standard deviations than `settled`, and the objective would fall by a smaller part than
         `nearly`: surfaces of nearly incompressible bodies go on to move by what no modulus follows.
@@ -284,7 +284,9 @@ def search(
             near, found = step.response, _line_search(at, step, objective, value)
         if found is None:
             return Found(model.evaluate(point.theta, point.states), value, Status.CONVERGED, iteration, near)
-        point, value = found
+        before, (point, value) = value, found
+        if before - value <= chosen.tolerance * before + NEGLIGIBLE:  # no more than a step that would not have been taken promises
+            return Found(point, value, Status.CONVERGED, iteration + 1, near)
         if chosen.left(start, point):
             return Found(point, value, Status.ITERATION_LIMIT, iteration + 1, near)
     return Found(point, value, Status.ITERATION_LIMIT, chosen.max_iterations, near)
