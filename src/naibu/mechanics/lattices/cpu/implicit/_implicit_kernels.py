@@ -30,6 +30,36 @@ _FAST = {"contract", "nsz"}
 SETUP = 6  # work of a step beside its iterations, in iterations
 
 
+@njit(cache=True, **UNCOUNTED)
+def turn_about(inertia, spin):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Turn the angular momentum `spin` (3,) of nodes about their centre into their angular velocity; `inertia` (3, 3) is lost.
+
+    The largest pivots first, by Gauss and Jordan. Nodes in a line, which may turn about it as fast as they like, do so at some speed.
+    """
+    largest = max(inertia[0, 0], inertia[1, 1], inertia[2, 2])
+    left = 7  # bits of the rows that were not taken yet
+    for _ in range(3):
+        k, pivot = -1, 1e-12 * largest
+        for a in range(3):
+            if left & (1 << a) and inertia[a, a] > pivot:
+                k, pivot = a, inertia[a, a]
+        if k < 0:
+            break
+        left -= 1 << k
+        for b in range(3):
+            inertia[k, b] /= pivot
+        spin[k] /= pivot
+        for a in range(3):
+            if a != k:
+                factor = inertia[a, k]
+                for b in range(3):
+                    inertia[a, b] -= factor * inertia[k, b]
+                spin[a] -= factor * spin[k]
+    for a in range(3):
+        if left & (1 << a):
+            spin[a] = 0.0
+
+
 @njit(cache=True, **COUNTED)
 def rigid_part(x, mass, impulse, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set `out` to the rigid motion that has the momenta of an impulse (3 pad,)."""
@@ -57,15 +87,8 @@ def rigid_part(x, mass, impulse, out):  # type: ignore[no-untyped-def]  # pragma
             inertia[0, 2] -= mass[i] * d0 * d2
             inertia[1, 2] -= mass[i] * d1 * d2
     inertia[1, 0], inertia[2, 0], inertia[2, 1] = inertia[0, 1], inertia[0, 2], inertia[1, 2]
-    values, vectors = np.linalg.eigh(inertia)
-    w = np.zeros(3)
-    for k in range(3):
-        if values[k] > 1e-12 * values[2]:  # nodes in a line do not turn about it
-            along = 0.0
-            for a in range(3):
-                along += vectors[a, k] * spin[a]
-            for a in range(3):
-                w[a] += along / values[k] * vectors[a, k]
+    turn_about(inertia, spin)
+    w = spin
     for i in range(pad):
         d0, d1, d2 = x[i] - centre[0], x[pad + i] - centre[1], x[2 * pad + i] - centre[2]
         alive = 1.0 if mass[i] > 0.0 else 0.0
