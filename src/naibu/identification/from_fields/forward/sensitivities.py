@@ -47,9 +47,14 @@ Gradient = tuple[FloatArray, list[FloatArray]]  # with respect to theta, and to 
 
 
 def moduli_of(zones: Zones, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return lambda and mu of every cell (m,), kPa, from ln mu, then ln(kappa / mu), of all zones (2 count,)."""
-    shear, ratio = np.exp(theta.reshape(2, -1))
-    return zones.per_cell(shear * (ratio - 2.0 / 3.0), shear)
+    """Return lambda and mu of every cell (m,), kPa, from ln mu, then ln(kappa / mu), of all zones (2 count,).
+
+    What is beyond all numbers becomes infinite: a step along what is not determined may lead there.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        shear, ratio = np.exp(theta.reshape(2, -1))
+        lame = shear * (ratio - 2.0 / 3.0)
+    return zones.per_cell(lame, shear)
 
 
 def logarithms(lame: FloatArray, shear: FloatArray) -> FloatArray:
