@@ -131,10 +131,8 @@ class _Overall:
         share = gone / sum(lengths) if len(set(lengths)) > 1 else None
         report_progress(self._progress, stage or self._stage, done=done, total=len(self._tasks), share=share)
 
-    def follow(
-        self, messages: SimpleQueue[Message], hindrance: Callable[[], str | None] = lambda: None
-    ) -> Generator[Outcome, None, None]:
-        """Take messages until all tasks are finished; yield the outcomes in the order of the tasks. What is a hindrance is told meanwhile."""
+    def follow(self, messages: SimpleQueue[Message], hindrance: Callable[[], str | None] = lambda: None) -> Generator[Outcome, None, None]:
+        """Take messages until all tasks are finished; yield the outcomes in their order. What is a hindrance is told meanwhile."""
         for index in range(len(self._tasks)):
             while index not in self.outcomes:
                 try:
