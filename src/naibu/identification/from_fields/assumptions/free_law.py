@@ -305,7 +305,7 @@ class _Joint:
 
 
 def _within(theta: FloatArray, step: FloatArray) -> FloatArray:
-    """Return a step (2 count,) that ends at the largest Poisson's ratio of searches: there kappa / mu changes nothing, and goes anywhere."""
+    """Return a step (2 count,) ending at the largest Poisson's ratio of searches: kappa / mu changes nothing there, it goes anywhere."""
     k = len(theta) // 2
     most = np.log(2.0 * (1.0 + MAX_POISSON_RATIO) / (3.0 * (1.0 - 2.0 * MAX_POISSON_RATIO)))
     return np.concatenate([step[:k], np.minimum(step[k:], np.maximum(most - theta[k:], 0.0))])
