@@ -10,6 +10,7 @@ import pytest
 
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
+from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.from_fields.assumptions.assumed_law import (
     DOES_NOT_FIT,
     HANGS_ON_LAW,
@@ -133,3 +134,12 @@ def test_multiples_of_a_modulus_hold_the_form_of_the_law_of_both() -> None:
     assert relative.law.shift == pytest.approx(np.zeros(4))  # the same change of both moduli
     assert relative.law.covariance[1, 1] == pytest.approx(0.04)
     assert relative.of_young_and_poisson(theta)[0][0] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_with_the_law_free_no_ratio_leaves_the_range_of_searches() -> None:
+    """A cube whose pressing keeps its volume: at the largest ratio of searches kappa / mu changes nothing, and went to any value."""
+    points = np.random.default_rng(3).uniform([-29.0, -29.0, 1.0], [29.0, 29.0, 59.0], (400, 3))
+    estimate = identified(points, points * ([0.94**-0.5 - 1.0] * 2 + [-0.06]), seed=3)
+    free = estimate.free_law
+    assert estimate.poisson_ratio[0] == pytest.approx(MAX_POISSON_RATIO) and free is not None and free.settled
+    assert free.shift[1] == pytest.approx(0.0, abs=1e-9)

@@ -12,6 +12,7 @@ from uneven_bodies import BODIES, NOISE, field_of
 from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.assumptions.volume_change import VolumeChange, volume_change
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
+from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_nodes
 
 PUSHES = ((0.0, 0.0, -4.0), (2.0, -1.0, -3.0), (0.0, 0.0, 5.0), (4.0, 0.0, 0.0), (-2.0, 3.0, 1.0))
@@ -58,3 +59,26 @@ def test_a_shear_of_a_gel_tells_no_signs() -> None:
     """Sheared to and fro it is the same body."""
     assert not found("alike", (4.0, 0.0, 0.0), np.eye(3)).signs_told
     assert found("alike", (0.0, 0.0, -4.0), np.eye(3)).signs_told
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("turn", [0.0, 0.15])
+def test_noise_of_a_bent_or_turned_plate_is_no_change_of_volume(turn: float, seed: int) -> None:
+    """Rivlin's bending of a block changes no volume; strains of the plate are of the size of the noise, its turns far larger."""
+    mesh = box((80.0, 60.0, 9.0), (14, 11, 2), centred=False)
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([0.0, 0.0, 0.0], [80.0, 60.0, 9.0], (1400, 3))
+    x, y, z = points.T
+    radius, angle = 500.0, x / 500.0
+    r = np.sqrt(2.0 * radius * z + radius**2)
+    bent = np.stack([r * np.sin(angle), y, r * np.cos(angle) - radius], axis=1)
+    u = bent @ rotation(turn).T - points
+    field = DisplacementField.from_arrays(points, u + 0.05 * rng.standard_normal(u.shape), sd_mm=0.05)
+    everywhere = np.isin(np.arange(mesh.n_points), boundary_nodes(mesh))
+    judged = volume_change(mesh, FieldLoadCase.of("bent", field, mesh, loaded=everywhere))
+    assert not judged.wrong_sign and not judged.doubtful_order
+
+
+def rotation(angle: float) -> np.ndarray:
+    """Return the rotation about y by an angle, rad."""
+    return np.array([[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]])

@@ -163,6 +163,16 @@ def test_intervals_hold_whatever_the_errors_of_the_sensor(
     assert (np.abs(deviations) < 1.96).sum() >= 9
 
 
+@pytest.mark.parametrize("step_s", [0.001, 0.0005])
+def test_a_delay_is_known_no_better_than_samples_follow_the_points_of_a_path(tmp_path: Path, clean: FloatArray, step_s: float) -> None:
+    """The speed of the path jumps every 2 ms, and all samples are taken an eighth of a millisecond behind a jump."""
+    text = VOXEL.replace("[simulation]", f"[simulation]\nstep_s = {step_s}")
+    made = problem(tmp_path, clean, np.arange(0.000125, ENDS, 0.002), 0, BOTH, text=text)
+    found = calibrate_lattice(made, made.unknowns.start, threads=1)
+    told = {error.quantity: error for error in sensor_errors_found(made, found)}["delay"]
+    assert abs(told.value) < 2.0 * told.sd < 0.003
+
+
 @pytest.mark.parametrize(("late_s", "offset", "quantity"), [(0.008, 0.0, "delay"), (0.0, 120.0, "offset along z"), (-0.02, 0.0, "delay")])
 def test_errors_that_were_not_sought_are_named_and_intervals_reach_the_truth(
     tmp_path: Path, clean: FloatArray, times: FloatArray, late_s: float, offset: float, quantity: str

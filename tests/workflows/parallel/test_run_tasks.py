@@ -201,6 +201,21 @@ def test_a_cluster_computes_the_same_and_an_absent_one_is_told() -> None:
     assert [o.value() for o in outcomes[1:]] == [0, 1, 4]
 
 
+def test_a_cluster_without_workers_is_told_and_computes_once_one_comes() -> None:
+    distributed = pytest.importorskip("distributed")
+    stages = []
+    with distributed.LocalCluster(n_workers=0, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp") as cluster:
+
+        def told(report: ProgressReport) -> None:
+            stages.append(report.stage)
+            if "has no worker: start `dask worker tcp://" in report.stage:
+                cluster.scale(1)
+
+        outcomes = run_tasks(squares(2), workers=Workers(cluster=cluster.scheduler_address), progress=told)
+    assert [o.value() for o in outcomes] == [0, 1]
+    assert any("has no worker" in stage for stage in stages)
+
+
 def test_an_absent_cluster(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr("naibu.workflows.parallel.cluster.ANSWER_S", 0.5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from queue import SimpleQueue
 from typing import Any
 
@@ -14,9 +15,25 @@ from naibu.workflows.parallel.task import Outcome, Task
 ANSWER_S = 10.0  # in which a scheduler has to answer
 
 
+@dataclass(frozen=True, slots=True)
+class Submitted:
+    """Tasks that a cluster has.
+
+    Attributes
+    ----------
+    messages : SimpleQueue
+        Their indices and outcomes, as they are finished.
+    hindrance : callable
+        Says what keeps the cluster from computing, None where nothing does.
+    """
+
+    messages: SimpleQueue[Any]
+    hindrance: Callable[[], str | None]
+
+
 @contextmanager
-def submitted(tasks: Sequence[Task], address: str) -> Iterator[SimpleQueue[Any]]:
-    """Give tasks to a cluster, and provide the queue of their indices and outcomes; on leaving, what is not finished is cancelled.
+def submitted(tasks: Sequence[Task], address: str) -> Iterator[Submitted]:
+    """Give tasks to a cluster; on leaving, what is not finished is cancelled.
 
     Dask itself begins a task again whose worker died.
 
@@ -48,9 +65,14 @@ def submitted(tasks: Sequence[Task], address: str) -> Iterator[SimpleQueue[Any]]
         for index, future in enumerate(futures):
             future.add_done_callback(_teller(index, tasks[index].name, messages))
         try:
-            yield messages
+            yield Submitted(messages, lambda: _hindrance(client, address))
         finally:
             client.cancel(futures)
+
+
+def _hindrance(client: Any, address: str) -> str | None:
+    """Say that the scheduler has no worker, for which Dask waits without an end: one may yet come, from the queue of a batch system."""
+    return None if client.scheduler_info()["workers"] else f"waiting, since {address} has no worker: start `dask worker {address}`"
 
 
 def _called(function: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:

@@ -83,8 +83,8 @@ def outcomes_in_order(
     if not tasks:
         return
     if workers.cluster is not None:
-        with submitted(tasks, workers.cluster) as messages:
-            yield from overall.follow(messages)
+        with submitted(tasks, workers.cluster) as cluster:
+            yield from overall.follow(cluster.messages, cluster.hindrance)
     elif workers.elsewhere:
         count = workers.processes(len(tasks), memory_mb)
         if pool is not None:
@@ -123,22 +123,22 @@ class _Overall:
             self._shares[index] = min(content.fraction, 0.99)
         self.report()
 
-    def report(self) -> None:
-        """Report how many tasks are done, with the shares of those that are computed."""
+    def report(self, stage: str | None = None) -> None:
+        """Report how many tasks are done, with the shares of those that are computed; `stage` stands for what is computed."""
         done = round(len(self.outcomes) + sum(self._shares.values()), 2)
         lengths = [task.length for task in self._tasks]
         gone = sum(lengths[i] for i in self.outcomes) + sum(lengths[i] * share for i, share in self._shares.items())
         share = gone / sum(lengths) if len(set(lengths)) > 1 else None
-        report_progress(self._progress, self._stage, done=done, total=len(self._tasks), share=share)
+        report_progress(self._progress, stage or self._stage, done=done, total=len(self._tasks), share=share)
 
-    def follow(self, messages: SimpleQueue[Message]) -> Generator[Outcome, None, None]:
-        """Take messages until all tasks are finished; yield the outcomes in the order of the tasks."""
+    def follow(self, messages: SimpleQueue[Message], hindrance: Callable[[], str | None] = lambda: None) -> Generator[Outcome, None, None]:
+        """Take messages until all tasks are finished; yield the outcomes in their order. What is a hindrance is told meanwhile."""
         for index in range(len(self._tasks)):
             while index not in self.outcomes:
                 try:
                     self.take(*messages.get(timeout=_REPEAT_S))
                 except Empty:
-                    self.report()
+                    self.report(hindrance())
             yield self.outcomes[index]
 
 

@@ -18,6 +18,7 @@ from scipy.special import chdtrc
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError
+from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point, moduli_of
 from naibu.identification.from_fields.forward.shaped_law import N_SHAPES, ShapedLaw
@@ -268,7 +269,7 @@ class _Joint:
         slope = self.gram[1:, 0] / self.variance + search.precision * (self.there.added - search.centre)
         added = -self.posterior(search) @ slope
         all_of_it = np.concatenate([[1.0], added])
-        theta, motion = self.follow @ all_of_it, [m @ all_of_it for m in self.motion]
+        theta, motion = _within(self.there.point.theta, self.follow @ all_of_it), [m @ all_of_it for m in self.motion]
         sd = np.sqrt(np.diag(np.linalg.pinv(self.quadratic.hessian) * self.variance + self.of_moduli(search)))
         return _Step(theta, added, motion, float(np.max(np.abs(theta) / np.maximum(sd, 1e-300))))
 
@@ -301,6 +302,13 @@ class _Joint:
             else 1.0
         )
         return max(1.0, sum(float(r @ r) for r in residuals) / freedom) * shared
+
+
+def _within(theta: FloatArray, step: FloatArray) -> FloatArray:
+    """Return a step (2 count,) ending at the largest Poisson's ratio of searches: kappa / mu changes nothing there, it goes anywhere."""
+    k = len(theta) // 2
+    most = np.log(2.0 * (1.0 + MAX_POISSON_RATIO) / (3.0 * (1.0 - 2.0 * MAX_POISSON_RATIO)))
+    return np.concatenate([step[:k], np.minimum(step[k:], np.maximum(most - theta[k:], 0.0))])
 
 
 def _eliminated(

@@ -7,17 +7,20 @@ cells, found without any mechanics, and the volume is that of finite strain.
 
 It is no proof: lungs and foams change their volume as well. Two readings are left open besides. Reversed displacements change volume by
 second orders of strain alone, as a Poisson's ratio somewhat below 0.5 does. And with components in another order a body that is squeezed, a
-sponge between plates, is one that is sheared: fields of either may be right.
+sponge between plates, is one that is sheared: fields of either may be right. Nor is noise a change of volume: where strains are small, as
+in a plate that is bent or a body that was turned between the scans, its gradient changes the volume as much as the shape, and components in
+another order make a large strain of the turn. What is doubted must therefore be found by two halves of the points alike.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
 
 from naibu.core.arrays import FloatArray
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.forward.representation_error import nearest_interpolated
@@ -37,6 +40,8 @@ class VolumeChange:
         With the components as they are, or all reversed, whichever is less.
     flipped, reordered : float
         The least with the sign of one component changed, and with components in another order.
+    beyond_noise : float
+        As `given`, without the noise: from products of what either half of the points says.
     component, order : int, ndarray
         That component, and the matrix (3, 3) that orders them, of a 1 or -1 in every row; times -1 it may be right as well.
     """
@@ -44,6 +49,7 @@ class VolumeChange:
     given: float
     flipped: float
     reordered: float
+    beyond_noise: float
     component: int
     order: FloatArray
 
@@ -63,7 +69,7 @@ class VolumeChange:
         return self.flipped > DECISIVE * self.given
 
     def _far_likelier(self, other: float) -> bool:
-        return self.given > MUCH and self.given > DECISIVE * other and other < LITTLE
+        return min(self.given, self.beyond_noise) > MUCH and self.given > DECISIVE * other and other < LITTLE
 
 
 def volume_change(mesh: Mesh, load_case: FieldLoadCase) -> VolumeChange:
@@ -76,19 +82,30 @@ def volume_change(mesh: Mesh, load_case: FieldLoadCase) -> VolumeChange:
     load_case : FieldLoadCase
         What was measured.
     """
-    gradient, weight = _gradients(mesh, load_case)
+    gradient, weight = _gradients(mesh, load_case.field)
     unit = np.eye(3)
     flips = [np.diag(np.where(np.arange(3) == k, -1.0, 1.0)) for k in range(3)]  # two signs are the negative of the third
     signs = [np.array([1.0, *rest]) for rest in product((1.0, -1.0), repeat=2)]
     orders = [s[:, None] * unit[list(axes)] for axes in permutations(range(3)) if axes != (0, 1, 2) for s in signs]
     shares = [_share(gradient, weight, matrix) for matrix in (unit, *flips, *orders)]
     flip, order = int(np.argmin(shares[1:4])), int(np.argmin(shares[4:]))
-    return VolumeChange(shares[0], shares[1 + flip], shares[4 + order], flip, orders[order])
+    beyond = _beyond_noise(mesh, load_case.field, weight)
+    return VolumeChange(shares[0], shares[1 + flip], shares[4 + order], beyond, flip, orders[order])
 
 
-def _gradients(mesh: Mesh, case: FieldLoadCase) -> tuple[FloatArray, FloatArray]:
+def _beyond_noise(mesh: Mesh, field: DisplacementField, weight: FloatArray) -> float:
+    """Return the change of volume over that of shape from products of what two halves of the points say: their noise is independent."""
+    drawn = np.random.default_rng(0).permutation(np.flatnonzero(field.valid))
+    everything = np.arange(len(field.valid))
+    one, other = (_gradients(mesh, replace(field, valid=np.isin(everything, half)))[0] for half in (drawn[::2], drawn[1::2]))
+    shape = float(np.average((_deviator(one) * _deviator(other)).sum(axis=(1, 2)), weights=weight))
+    change = min(float(np.average(_dilatation(sign * one) * _dilatation(sign * other), weights=weight)) for sign in (1.0, -1.0))
+    return float(np.sqrt(max(change, 0.0) / shape)) if shape > 0.0 else 0.0
+
+
+def _gradients(mesh: Mesh, field: DisplacementField) -> tuple[FloatArray, FloatArray]:
     """Return the mean gradient of the displacement in every cell (m, 3, 3), and the volumes of the cells (m,), mm^3."""
-    nodes = nearest_interpolated(mesh, case.field)
+    nodes = nearest_interpolated(mesh, field)
     discrete = elements(mesh, "standard")
     volume = discrete.weights.sum(axis=1)
     return np.einsum("mq,mai,mqaj->mij", discrete.weights, nodes[mesh.cells], discrete.gradients) / volume[:, None, None], volume
@@ -97,8 +114,15 @@ def _gradients(mesh: Mesh, case: FieldLoadCase) -> tuple[FloatArray, FloatArray]
 def _share(gradient: FloatArray, weight: FloatArray, matrix: FloatArray) -> float:
     """Return the change of volume over that of shape with vectors multiplied by a matrix, or by its negative, whichever is less."""
     turned = np.einsum("ij,mjk->mik", matrix, gradient)
-    strain = 0.5 * (turned + np.swapaxes(turned, 1, 2))
-    strain -= np.einsum("mkk->m", strain)[:, None, None] / 3.0 * np.eye(3)
-    shape = float(np.average((strain**2).sum(axis=(1, 2)), weights=weight))
-    change = min(float(np.average((np.linalg.det(np.eye(3) + sign * turned) - 1.0) ** 2, weights=weight)) for sign in (1.0, -1.0))
+    shape = float(np.average((_deviator(turned) ** 2).sum(axis=(1, 2)), weights=weight))
+    change = min(float(np.average(_dilatation(sign * turned) ** 2, weights=weight)) for sign in (1.0, -1.0))
     return float(np.sqrt(change / max(shape, 1e-300)))
+
+
+def _deviator(gradient: FloatArray) -> FloatArray:
+    strain = 0.5 * (gradient + np.swapaxes(gradient, 1, 2))
+    return np.asarray(strain - np.einsum("mkk->m", strain)[:, None, None] / 3.0 * np.eye(3))
+
+
+def _dilatation(gradient: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.det(np.eye(3) + gradient) - 1.0)

@@ -47,9 +47,10 @@ Gradient = tuple[FloatArray, list[FloatArray]]  # with respect to theta, and to 
 
 
 def moduli_of(zones: Zones, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return lambda and mu of every cell (m,), kPa, from ln mu, then ln(kappa / mu), of all zones (2 count,)."""
-    shear, ratio = np.exp(theta.reshape(2, -1))
-    return zones.per_cell(shear * (ratio - 2.0 / 3.0), shear)
+    """Return lambda and mu of every cell (m,), kPa, from ln mu, then ln(kappa / mu), of all zones (2 count,); inf beyond all numbers."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        shear, ratio = np.exp(theta.reshape(2, -1))
+        return zones.per_cell(shear * (ratio - 2.0 / 3.0), shear)
 
 
 def logarithms(lame: FloatArray, shear: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ from naibu.mechanics.lattices.model.lattice import require_positive
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
 
 WINDOW_S = 0.02
+SAMPLED_PIECES = 8  # of a path, from which on it is a smooth motion that was sampled, and no motion at constant speeds
 LEAST_WITHIN = 0.02  # of the samples of a record within the study: with fewer, times are likely to have another unit
 
 
@@ -34,6 +35,9 @@ class RecordedForces:
         Of the steps in the means of their windows, by the samples that were taken in them: simulated forces are averaged alike.
     phase_s : ndarray, shape (windows * window_steps, bodies)
         How much later than the middle of its step a sample was taken, on the average of those in a step, s.
+    path_phase_s : ndarray, shape (bodies,)
+        How much later than the middle of the pieces of a sampled path samples are taken, s: at its points the speed of a path jumps, and
+        where all samples follow them alike, simulated forces seem late or early by that.
     sd_mn : ndarray, shape (bodies,)
         Standard deviation of a component in one sample.
     """
@@ -44,6 +48,7 @@ class RecordedForces:
     samples: FloatArray
     shares: FloatArray
     phase_s: FloatArray
+    path_phase_s: FloatArray
     sd_mn: FloatArray
 
     @classmethod
@@ -88,7 +93,7 @@ class RecordedForces:
                 "is the unit of times another one, to be named in the column, as in time_ms?"
             )
         shares = np.full((windows * each, bodies), 1.0 / each)
-        phase = np.zeros_like(shares)
+        phase, path_phase = np.zeros_like(shares), np.zeros(bodies)
         sums, samples, sd = np.zeros((windows, bodies, 3)), np.zeros((windows, bodies)), np.full(bodies, np.nan)
         for body, times, force in records:
             place = np.floor(times / (each * study.step_s) - 1e-9).astype(np.int64)
@@ -106,10 +111,23 @@ class RecordedForces:
             shares[:, body] = count / np.maximum(np.repeat(samples[:, body], each), 1.0)
             late = times[inside] - study.step_s * (taken + 0.5)
             phase[:, body] = np.bincount(taken, weights=late, minlength=windows * each) / np.maximum(count, 1)
+            motion = study.bodies[body].motion
+            path_phase[body] = _after_middle(times[inside], np.array(() if motion is None else motion.kinks))
             sd[body] = sd_mn if sd_mn is not None else _noise(study.bodies[body].name, force)
         last = int(np.flatnonzero(samples.any(axis=1))[-1]) + 1 if records else 0
         mean = np.where(samples[:last, :, None] > 0.0, sums[:last] / np.maximum(samples[:last, :, None], 1.0), np.nan)
-        return cls(each, study.step_s, mean, samples[:last], shares[: last * each], phase[: last * each], sd)
+        return cls(each, study.step_s, mean, samples[:last], shares[: last * each], phase[: last * each], path_phase, sd)
+
+
+def _after_middle(times: FloatArray, kinks: FloatArray) -> float:
+    """Return the median over pieces of a sampled path, which end at kinks (k,), s, of how late samples are after their middle, s."""
+    piece = np.searchsorted(kinks, times)
+    within = (piece > 0) & (piece < len(kinks))
+    if len(kinks) <= SAMPLED_PIECES or not within.any():
+        return 0.0
+    late = times[within] - 0.5 * (kinks[piece[within] - 1] + kinks[piece[within]])
+    count = np.bincount(piece[within])
+    return float(np.median((np.bincount(piece[within], late) / np.maximum(count, 1))[count > 0]))
 
 
 def _noise(name: str, force: FloatArray) -> float:

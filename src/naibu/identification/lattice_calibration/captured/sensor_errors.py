@@ -131,7 +131,8 @@ class BodyResiduals:
     delay_slopes : ndarray, shape (p,)
         How it changes with the parameters.
     delay_variance : float
-        At known parameters; with how far it may be off because samples are not taken in the middle of steps.
+        At known parameters; with how far it may be off because samples are not taken in the middle of steps, or of the pieces of a sampled
+        path.
     """
 
     counted: BoolArray
@@ -210,9 +211,10 @@ def body_residuals(
     explained_slopes = -(gain @ raw_slopes) - delay_slopes[:, None, None] * of_delay
     spread = ((back * shrunk) @ back.T).diagonal() + variance * (of_delay**2).max(axis=1, initial=0.0) * float(errors.delay)
     explained = -(gain @ raw)
+    off_middle = variance * float((along * weight * doubtful[counted]).sum()) if errors.delay else 0.0
     return BodyResiduals(
         counted, residual, slopes, explained, explained_slopes, spread, means, seen[counted] - design @ explained, delay, delay_slopes,
-        variance + (variance * float((along * weight * doubtful[counted]).sum())) ** 2 if errors.delay else 0.0,
+        variance + off_middle**2 + record.path_phase_s[body] ** 2 if errors.delay else 0.0,
     )  # fmt: skip
 
 
