@@ -90,6 +90,9 @@ class WatchedPage:
             self.said["refused message"] += 1
             return
         self._doing = command.kind
+        before = self._now()  # a cut that was prepared opens first, and keeps a state of its own
+        self._obey()
+        self._note_kept(before)
         before = self._now()
         self.page.command(command)
         self._obey()

@@ -21,6 +21,7 @@ from naibu.simulation.lattice_cut import LatticeCut
 
 CUT_STAGES = ("separating the mesh", "bringing volume strains to balance", "factorizing the stiffness", "lifting the tool")
 PART = 0.1  # of a step, in which volume strains come to balance
+SHARES = (1.0, 0.5, 0.25)  # of the way to that balance that are tried where the body has moved on since it was found
 
 
 @dataclass(slots=True, eq=False)
@@ -63,7 +64,8 @@ class BackgroundCut:
             raise self._failure
         assert self._made is not None
         body, found, settled = self._made
-        return body, DynamicState(found.nodal(state.displacement) + settled, found.nodal(state.velocity))
+        at = found.nodal(state.displacement)
+        return body, DynamicState(at + _share_that_helps(body, at, settled) * settled, found.nodal(state.velocity))
 
     def wait(self) -> None:
         """Wait for the thread."""
@@ -121,6 +123,26 @@ def cut_in_balance(
     cutting = BackgroundCut(body)
     found = cutting.prepare(state, blade, distance_mm)
     return *cutting.result(state), found
+
+
+def _share_that_helps(body: FiniteElementBody, at: FloatArray, settled: FloatArray) -> float:
+    """Return the share of a way (n, 3), mm, that leaves least out of balance from displacements (n, 3), mm, and inverts no element.
+
+    The way is that to the balance of the body as the blade passed. Where the body has moved on by much until the cut opens, as where a tool
+    squeezed it then, that way would fling it, and invert elements, from which it finds no balance any more: 0 where none of it helps.
+    """
+    weight = body.engine.mass[:, None] * body.gravity
+
+    def left(share: float) -> float:
+        _, internal, smallest = body.engine.assembler.forces(at + share * settled)
+        wrong = np.abs(internal - weight)
+        wrong[body.supported] = 0.0
+        return float(wrong.sum()) if smallest > 0.0 else np.inf
+
+    without = left(0.0)
+    ends = {share: left(share) for share in SHARES}
+    best = min(SHARES, key=ends.__getitem__)
+    return best if ends[best] < without else 0.0
 
 
 def _settled(body: FiniteElementBody, behind: DynamicState) -> FloatArray:

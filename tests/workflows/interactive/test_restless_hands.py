@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from touched_models import MODELS
-from watched_page import driven
+from watched_page import WatchedPage, driven
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -30,6 +32,26 @@ def test_a_body_that_nobody_cut_comes_back_to_its_shape(seed: int) -> None:
     """An elastic one that is held; a lattice of dashpots in series keeps dents, as dough does."""
     page = driven(MODELS["mesh"](), 100 + seed, 60, cuts=False, settling_s=2.0)
     assert page.failures == [] and page.left < 1e-3
+
+
+def test_a_cut_that_opens_in_the_frame_in_which_a_node_is_gripped_is_undone_for_itself() -> None:
+    """Both keep a state; long runs of hands counted one of them, and failed where rounding let a tool leave a gel just then."""
+    page = WatchedPage(MODELS["mesh"]())
+    try:
+        page.frame()
+        points = page.simulation.body.points
+        (_, y, z), top = points.max(axis=0) + 1.0, int(points[:, 2].argmax())
+        edges = [[[0.0, end, z], [0.0, end, 0.5 * z]] for end in (-y, y)]
+        page.say(json.dumps({"type": "cut", "edges": edges}))
+        page.say(json.dumps({"type": "grip", "node": top}))
+        assert page.simulation.last.topology == 1 and len(page.simulation._kept) == 2
+        page.frame()
+        for _ in range(2):
+            page.say('{"type": "undo"}')
+        assert not page.simulation._kept
+        assert page.failures == []
+    finally:
+        page.close()
 
 
 @pytest.mark.slow

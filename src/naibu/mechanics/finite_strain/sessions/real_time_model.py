@@ -1,4 +1,4 @@
-"""A finite element model whose steps use the tangents of earlier ones, and such a tangent: with contacts, factorized."""
+"""A finite element model whose steps use the tangents of earlier ones, such a tangent, and the nodes that it is prepared for."""
 
 from __future__ import annotations
 
@@ -9,17 +9,21 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
+from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import LipMultipliers, lips_of, with_multipliers, with_secant
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import pairs_along_normals
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import lips_about_to_change, pairs_along_normals
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
 FAINT = 1e-5  # strain of the body under contact forces too small to be told from none
+AHEAD = 160  # nodes about to be in contact, at most
+REACH = 0.2  # extents of the body around an indenter in which they are sought
 
 Contacts = tuple[Sequence[NearbyContact], Sequence[Int32Array], Sequence[Int32Array]]
 
@@ -109,3 +113,36 @@ def tangent_at(
     sides = [pairs_along_normals(some, factors, u, held) for some in lips_of(assembler) if some.friction == 0.0]
     pairs = sides[0] if sides else PairedMotion.none()
     return EarlierTangent(factors, dilatation, contact, held, touched, lips, solver, u, time.thread_time() - began, pairs)
+
+
+def nodes_ahead(
+    contacts: Sequence[Contact], gaps: Sequence[FloatArray], corners: int, extent_mm: float, assembler: Assembler, displacement: FloatArray
+) -> IntArray:
+    """Return the nodes in contact, those about to be, the nearest first, and those of lips that are about to open or close.
+
+    Parameters
+    ----------
+    contacts : sequence of Contact
+        Of faces with this number of `corners`.
+    gaps : sequence of ndarray, shape (p,)
+        Distances of their points from the indenters, mm.
+    corners : int
+        Nodes of a face.
+    extent_mm : float
+        Of the body.
+    assembler : Assembler
+        Its elements, with the lips of cuts.
+    displacement : ndarray, shape (n, 3)
+        Of its nodes, mm.
+    """
+    nodes, order = [np.zeros((0, corners), np.int64)], [np.zeros(0)]
+    for contact, gap in zip(contacts, gaps, strict=True):
+        near = np.flatnonzero(gap < REACH * extent_mm)
+        nodes.append(contact.nodes[near])
+        order.append(np.maximum(gap[near], 0.0))
+    depths = np.concatenate(order)
+    ranked = np.concatenate(nodes)[np.argsort(depths, kind="stable")]
+    touching = len(np.unique(ranked[: np.count_nonzero(depths == 0.0)]))
+    first = ranked.ravel()[np.sort(np.unique(ranked, return_index=True)[1])][: touching + AHEAD]
+    lips = [lips_about_to_change(some, displacement) for some in lips_of(assembler)]
+    return np.concatenate([first, *lips]).astype(np.int64)

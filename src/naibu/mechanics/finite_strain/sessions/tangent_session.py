@@ -17,8 +17,7 @@ from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedCo
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, TangentThread
 from naibu.mechanics.finite_strain.sessions.kept_tangents import KeptTangents
-from naibu.mechanics.finite_strain.sessions.nodes_ahead import nodes_ahead
-from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel, tangent_at
+from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel, nodes_ahead, tangent_at
 from naibu.mechanics.finite_strain.sessions.trial_displacement import PASSABLE
 
 PERIOD = 10  # steps after which a tangent is renewed without a thread
