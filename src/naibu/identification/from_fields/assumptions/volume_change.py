@@ -76,7 +76,7 @@ def volume_change(mesh: Mesh, load_case: FieldLoadCase) -> VolumeChange:
     load_case : FieldLoadCase
         What was measured.
     """
-    gradient, weight = _gradients(mesh, load_case)
+    gradient, weight = mean_gradients(mesh, nearest_interpolated(mesh, load_case.field))
     unit = np.eye(3)
     flips = [np.diag(np.where(np.arange(3) == k, -1.0, 1.0)) for k in range(3)]  # two signs are the negative of the third
     signs = [np.array([1.0, *rest]) for rest in product((1.0, -1.0), repeat=2)]
@@ -86,12 +86,11 @@ def volume_change(mesh: Mesh, load_case: FieldLoadCase) -> VolumeChange:
     return VolumeChange(shares[0], shares[1 + flip], shares[4 + order], flip, orders[order])
 
 
-def _gradients(mesh: Mesh, case: FieldLoadCase) -> tuple[FloatArray, FloatArray]:
-    """Return the mean gradient of the displacement in every cell (m, 3, 3), and the volumes of the cells (m,), mm^3."""
-    nodes = nearest_interpolated(mesh, case.field)
+def mean_gradients(mesh: Mesh, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean gradient of a displacement (n, 3), mm, in every cell (m, 3, 3), and the volumes of the cells (m,), mm^3."""
     discrete = elements(mesh, "standard")
     volume = discrete.weights.sum(axis=1)
-    return np.einsum("mq,mai,mqaj->mij", discrete.weights, nodes[mesh.cells], discrete.gradients) / volume[:, None, None], volume
+    return np.einsum("mq,mai,mqaj->mij", discrete.weights, u[mesh.cells], discrete.gradients) / volume[:, None, None], volume
 
 
 def _share(gradient: FloatArray, weight: FloatArray, matrix: FloatArray) -> float:
