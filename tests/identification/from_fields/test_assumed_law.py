@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -17,13 +18,14 @@ from naibu.identification.from_fields.assumptions.assumed_law import (
     NOT_SOUGHT,
     equivalent_strain,
     judged,
+    told_changes,
     warned,
 )
 from naibu.identification.from_fields.assumptions.free_law import FreeLaw
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
-from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
-from naibu.identification.from_fields.regions.relative_map import relative_to
+from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
+from naibu.identification.from_fields.regions.relative_map import relative_to, zones_beside
 from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, by_law, intervals
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.primitives import box
@@ -113,8 +115,28 @@ def test_where_no_equilibrium_is_found_with_the_law_free_that_is_said() -> None:
     theta, plain = np.log([100.0, 8.0]), Uncertainty(np.eye(2), np.diag([0.01, 0.01]))
     mesh = box((10.0, 10.0, 20.0), (1, 1, 2), layers=[("a", 10.0), ("b", 10.0)], centred=False)
     zones = Zones.of(mesh, known={"a": (10.0, 0.45)})
-    assert judged(EXPLAINED, FreeLaw.lost(("a", "b"), 2), zones, theta, plain) == (EXPLAINED, NOT_SOUGHT)
-    assert judged(EXPLAINED, None, zones, theta, plain) == (EXPLAINED, "")
+    assert judged(EXPLAINED, FreeLaw.lost(("a", "b"), 2), zones, theta, plain, elements_known=True) == (EXPLAINED, NOT_SOUGHT)
+    assert judged(EXPLAINED, None, zones, theta, plain, elements_known=True) == (EXPLAINED, "")
+
+
+def test_what_speaks_against_the_law_may_be_elements_where_their_error_is_not_known() -> None:
+    """Where cells of half the size fell back to small strain, the law was blamed all the same."""
+    theta, plain = np.log([100.0, 8.0]), Uncertainty(np.eye(2), np.diag([0.01, 0.01]))
+    mesh = box((10.0, 10.0, 20.0), (1, 1, 2), layers=[("a", 10.0), ("b", 10.0)], centred=False)
+    zones, none = Zones.of(mesh, known={"a": (10.0, 0.45)}), np.zeros((2, 4))
+    free = FreeLaw(("a", "b"), np.array([0.3, 0.0]), np.zeros((2, 2)), none, none, {"yeoh": 1e-9}, settled=True)
+    for known in (True, False):
+        told = judged(EXPLAINED, free, zones, theta, plain, elements_known=known)[0].reasons[0]
+        assert told.startswith(DOES_NOT_FIT) and ("elements are too large" in told) is not known and "that of b 35 % higher" in told
+
+
+def test_multiples_of_a_cell_change_as_those_of_the_largest_zone() -> None:
+    """That the modulus which is 1 by definition would be another one was told of maps."""
+    mesh = box((10.0, 10.0, 40.0), (1, 1, 4), centred=False)
+    zones = zones_beside(mesh, 1)
+    zones = replace(zones, of_cell=np.array([0, KNOWN, 0, 1]), names=("large", "small"))
+    assert told_changes(zones, np.log([0.7, 0.7])) == ""
+    assert told_changes(zones, np.log([0.5, 1.0])) == "that of small 100 % higher"
 
 
 def test_a_map_says_first_that_it_takes_the_law_for_right() -> None:

@@ -14,7 +14,14 @@ import pytest
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.assumptions.other_readings import DECISIVE, Reading, judged_readings
+from naibu.identification.from_fields.assumptions.other_readings import (
+    DECISIVE,
+    EXCHANGED,
+    PLACED_LATER,
+    REVERSED,
+    Reading,
+    judged_readings,
+)
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
@@ -31,6 +38,7 @@ from naibu.meshing.surface import boundary_nodes, side_nodes
 from naibu.validation.specimens.quadratic_body import QuadraticBody
 
 PUSHES = {"pressed": (0.0, 0.0, -5.0), "pulled": (1.0, 0.0, 5.0), "sheared": (6.0, 0.0, -2.0)}
+OTHERS = {"reversed": REVERSED, "later": PLACED_LATER, "exchanged": EXCHANGED}
 SD_MM = 0.02
 EXPLAINED = Verdict(Explanation.EXPLAINED, (), "residuals are 1 times the noise", 1.0, 0.0, 0.0)
 
@@ -62,11 +70,11 @@ def found(push: str, kind: str) -> FieldEstimate:
     model = box([40.0] * 3, [8] * 3, centred=False)
     upper = (model.points[model.cells].mean(axis=1)[:, 2] > 20.0).astype(np.int64)
     model = Mesh.from_arrays(model.points, model.cells, "hexahedron", regions=upper, region_names=("unknown", "known"))
-    if kind == "later":
+    if kind in ("later", "exchanged"):
         points = points + u
         kept = ((points > 0.0) & (points < 40.0)).all(axis=1)
         points, u = points[kept], u[kept]
-    field = DisplacementField.from_arrays(points, -u if kind == "reversed" else u, sd_mm=SD_MM)
+    field = DisplacementField.from_arrays(points, -u if kind in ("reversed", "exchanged") else u, sd_mm=SD_MM)
     everywhere = np.isin(np.arange(model.n_points), boundary_nodes(model))
     zones = Zones.of(model, known={"known": (12.0, 0.45)})
     return identify_field(model, [FieldLoadCase.of("push", field, model, loaded=everywhere)], zones, law="neo_hookean")
@@ -78,17 +86,42 @@ def test_a_true_field_is_not_accused(push: str, kind: str) -> None:
     assert "fit far better" not in found(push, kind).identifiability[0]
 
 
-@pytest.mark.parametrize(("push", "kind"), [("pressed", "reversed"), ("pulled", "reversed"), ("sheared", "reversed"), ("sheared", "later")])
-def test_another_reading_is_told_or_left_open(push: str, kind: str) -> None:
-    told = " ".join(found(push, kind).identifiability)
-    assert "fit far better with all displacements reversed" in told or "fit as well with all displacements reversed" in told
+@pytest.mark.parametrize(
+    ("push", "kind"),
+    [
+        ("pressed", "reversed"),
+        ("pressed", "later"),
+        ("pulled", "later"),
+        ("sheared", "exchanged"),
+        *[
+            pytest.param(push, kind, marks=pytest.mark.slow)
+            for push, kind in (("sheared", "reversed"), ("sheared", "later"), ("pressed", "exchanged"), ("pulled", "exchanged"))
+        ],
+    ],
+)
+def test_another_reading_is_told_and_intervals_hold_the_moduli_that_are_right_then(push: str, kind: str) -> None:
+    """A body pulled by an eighth, its vectors placed where points came to lie, was explained by a modulus of 6.2 to 9.8 kPa."""
+    one = found(push, kind)
+    told = one.identifiability[0]
+    assert f"fit far better with {OTHERS[kind]}" in told and "the law does not fit" not in told
+    ((low, high),) = one.intervals()[0]
+    assert low < 6.0 < high
+
+
+@pytest.mark.slow
+def test_what_another_law_explains_as_well_is_left_open() -> None:
+    one = found("pulled", "reversed")
+    assert "the law does not fit" in one.identifiability[0]
+    assert "fit as well with all displacements reversed" in " ".join(one.identifiability)
 
 
 def test_what_fits_as_well_is_a_note_and_what_fits_worse_nothing() -> None:
-    none = np.zeros(2)
-    judged = judged_readings(EXPLAINED, [Reading("this", none, 0.3 * DECISIVE), Reading("that", none, -3.0 * DECISIVE)])
+    zones, theta = Zones.of(box([1.0] * 3, [1] * 3), known={}), np.log([2.0, 10.0])
+    none, softer = np.zeros(2), np.log([0.5, 1.0])
+    judged = judged_readings(EXPLAINED, [Reading("this", none, 0.3 * DECISIVE), Reading("that", none, -3.0 * DECISIVE)], zones, theta)
     assert judged.explanation is Explanation.EXPLAINED and not judged.reasons
     assert judged.notes == ("The fields would fit as well with this: that they are not is taken for given.",)
-    assert judged_readings(EXPLAINED, [Reading("that", none, -3.0 * DECISIVE)]) == EXPLAINED
-    against = judged_readings(EXPLAINED, [Reading("this", none, 2.0 * DECISIVE)])
-    assert against.explanation is Explanation.IN_PART and "with this (chi squared falls by 32): check signs" in against.reasons[0]
+    assert judged_readings(EXPLAINED, [Reading("that", none, -3.0 * DECISIVE)], zones, theta) == EXPLAINED
+    against = judged_readings(EXPLAINED, [Reading("this", softer, 4.0 * DECISIVE), Reading("that", none, 2.0 * DECISIVE)], zones, theta)
+    assert against.explanation is Explanation.IN_PART
+    assert "with this (chi squared falls by 100), which would" in against.reasons[0] and "50 % lower" in against.reasons[0]

@@ -11,7 +11,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumed_law
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
-from naibu.identification.from_fields.assumptions.other_readings import judged_readings, other_readings
+from naibu.identification.from_fields.assumptions.other_readings import covariance_of_readings, judged_readings, other_readings
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
@@ -94,8 +94,12 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     unbiased = Objective(bounds=settings.bounds).clipped(found.size.theta - found.bias)
     theta = np.where(at_bounds > 0.0, found.size.theta, unbiased)
     by_elements = None if of_elements is None else replace(found.of_noise, covariance=of_elements).of_young_and_poisson(theta)[0]
-    judged = judged_readings(judged, other_readings(found.at, found.quadratic, found.shared * max(1.0, found.misfit / fit.freedom)))
-    judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total)
+    known = found.size.shift is not None and found.size.alike
+    judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total, elements_known=known)
+    variance = found.shared * max(1.0, found.misfit / fit.freedom)
+    readings = other_readings(model, fit.point, 0.0 if free is None else free.fall, variance, settings.bounds)
+    judged = judged_readings(judged, readings, model.zones, theta)
+    total = total.with_added(covariance_of_readings(readings, len(theta)))
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))
     budget = ErrorBudget(found.of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), found.shared)

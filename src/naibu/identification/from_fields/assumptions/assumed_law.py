@@ -11,7 +11,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.assumptions.free_law import FreeLaw, free_law
 from naibu.identification.from_fields.assumptions.other_assumptions import holds
-from naibu.identification.from_fields.forward.load_cases import Zones
+from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, young_and_poisson
 from naibu.identification.from_fields.uncertainty import EXACT, LawPart, Uncertainty, by_law, intervals
 from naibu.identification.verdict import Explanation, Verdict
@@ -21,6 +21,7 @@ LEAST_STRAIN = 0.02  # equivalent strain, root mean square, below which forms of
 UNLIKELY = 1e-3  # probability of so large a score by chance, below which fields speak against the law
 MODULUS = 0.1  # change of the logarithm of a modulus from which on it matters
 DOES_NOT_FIT = "the law does not fit"
+OR_ELEMENTS = ", or elements are too large, whose errors at finite strain are not known"
 HANGS_ON_LAW = "moduli hang on the assumed law"
 NOT_SOUGHT = "moduli may hang on the assumed law, whose shape could not be sought as well"
 MOST_ZONES = 40  # whose laws are sought: four columns each as long as the displacement
@@ -73,32 +74,49 @@ def with_law_free(
     return free, LawPart(stretch * free.shift, free.covariance * np.outer(stretch, stretch))
 
 
-def judged(judged: Verdict, free: FreeLaw | None, zones: Zones, theta: FloatArray, total: Uncertainty) -> tuple[Verdict, str]:
-    """Return the verdict with what fields say against the law, where that changes a modulus by much; and what hangs on the law."""
-    against = _against(free, zones, theta)
+def judged(
+    judged: Verdict, free: FreeLaw | None, zones: Zones, theta: FloatArray, total: Uncertainty, *, elements_known: bool
+) -> tuple[Verdict, str]:
+    """Return the verdict with what fields say against the law, where that changes a modulus by much; and what hangs on the law.
+
+    Where it is not known what elements of half the size change at finite strain (`elements_known`), errors of elements may look like
+    another law.
+    """
+    against = _against(free, zones, theta, elements_known=elements_known)
     if against:
         part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
         judged = replace(judged, explanation=part, reasons=(against, *judged.reasons))
     return judged, hangs_on_law(judged, free, total, theta)
 
 
-def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray) -> str:
+def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray, *, elements_known: bool) -> str:
     """Say that fields ask for another law under which a modulus would be another one by much; empty if they do not."""
     if free is None or not free.found or not free.probabilities:
         return ""
     law, probability = min(free.probabilities.items(), key=lambda one: one[1])
     change = np.log(young_and_poisson(theta + free.shift)[0] / young_and_poisson(theta)[0])
-    moved = [i for i in np.argsort(-np.abs(change)).tolist() if abs(change[i]) > MODULUS]
-    if probability > UNLIKELY or not moved:
+    changes = told_changes(zones, change)
+    if probability > UNLIKELY or not changes:
         return ""
+    return (
+        f"{DOES_NOT_FIT}{'' if elements_known else OR_ELEMENTS}: fields ask for stress that grows otherwise with strain, as in a {law} "
+        f"law; with its shape sought as well, Young's modulus would be another one: {changes}"
+    )
+
+
+def told_changes(zones: Zones, change: FloatArray) -> str:
+    """Return in words the largest changes of the logarithms of Young's moduli (count,) that matter; empty where none does.
+
+    Where a single cell is all that is known, moduli are multiples of that of the largest zone.
+    """
+    if len(zones.known) == 1 and zones.known[0].is_unit and int((zones.of_cell == KNOWN).sum()) == 1:
+        change = change - change[np.argmax(np.bincount(zones.of_cell[zones.of_cell != KNOWN], minlength=zones.count))]
+    moved = [i for i in np.argsort(-np.abs(change)).tolist() if abs(change[i]) > MODULUS]
     each = [
         f"that of {zones.names[i]} {100.0 * abs(np.expm1(change[i])):.0f} % {'higher' if change[i] > 0.0 else 'lower'}"
         for i in moved[:LISTED]
     ]
-    return (
-        f"{DOES_NOT_FIT}: fields ask for stress that grows otherwise with strain, as in a {law} law; with its shape sought as well, "
-        f"Young's modulus would be another one: {' and '.join(each)}"
-    )
+    return " and ".join(each)
 
 
 def hangs_on_law(judged: Verdict, free: FreeLaw | None, total: Uncertainty, theta: FloatArray) -> str:

@@ -52,6 +52,8 @@ class FreeLaw:
         that is small strain, which no law at finite strain has for a special case.
     settled : bool
         Whether the search ended where steps are short; otherwise the last step is part of the covariance.
+    fall : float
+        By how much chi squared falls with these shapes.
     """
 
     materials: tuple[str, ...]
@@ -61,6 +63,7 @@ class FreeLaw:
     shapes_sd: FloatArray
     probabilities: dict[str, float]
     settled: bool
+    fall: float = 0.0
 
     @property
     def found(self) -> bool:
@@ -96,7 +99,7 @@ def free_law(at: Linearised, of_elements: Sequence[FloatArray] | None, freedom: 
     materials = materials_of(at.model.zones)
     search = _Search.of(at.model, np.stack(list(materials.values())), of_elements, freedom)
     try:
-        here = search.evaluated(at.point.theta, search.centre, at.point.states)
+        start = here = search.evaluated(at.point.theta, search.centre, at.point.states)
         first = joint = search.linearised(here)
     except ConvergenceError:
         return FreeLaw.lost(tuple(materials), len(at.point.theta))
@@ -118,6 +121,7 @@ def free_law(at: Linearised, of_elements: Sequence[FloatArray] | None, freedom: 
     return FreeLaw(
         tuple(materials), here.point.theta - at.point.theta, covariance, here.added[: g * N_SHAPES].reshape(g, -1), sd.reshape(g, -1),
         {} if at.model.law.linear else {name: first.probability(search, kinds) for name, kinds in OTHER_LAWS.items()}, settled,
+        max(0.0, sum(float(a @ a - b @ b) for a, b in zip(start.residuals, here.residuals, strict=True))),
     )  # fmt: skip
 
 

@@ -1,34 +1,46 @@
-"""Other readings of the vectors of a field: all of them reversed, or standing where points came to lie.
+"""Other readings of the vectors of a field: reversed, standing where points came to lie, or both, as of scans that were exchanged.
 
-Small strain tells neither: reversed, a field is that of the same body under reversed loads. At finite strain the parts of the
-displacement that are of second order keep their sign. To first order in these, a field whose vectors are reversed leaves as much less or
-more as small strain does in comparison with the law, twice; and one whose vectors stand at the points of the loaded body leaves what the
-vectors are apart there. Moduli and the motion of the loaded nodes are refitted to either, and misfits compared.
+Small strain tells none of them: reversed, a field is that of the same body under reversed loads. At finite strain the parts of the
+displacement that are of second order keep their sign. Moduli and the motion of the surface are therefore refitted to every reading, and
+misfits compared. Residuals alone do not tell: vectors of a body that is pulled, placed where points came to lie, were explained by a
+modulus a third too high. Nor do derivatives at the fit of the fields as they are: in a body that is pressed by an eighth they found no sign
+of that, where the refit leaves half as much.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.sparse as sp
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import ConvergenceError
-from naibu.identification.from_fields.assumptions.assumed_law import LEAST_STRAIN, largest_strain
-from naibu.identification.from_fields.forward.field_laws import field_law
-from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, whitening
-from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of
-from naibu.identification.from_fields.mesh_error import Refit, refitted
+from naibu.core.mesh import Mesh
+from naibu.core.progress import report_progress
+from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, LEAST_STRAIN, largest_strain, told_changes
+from naibu.identification.from_fields.assumptions.volume_change import mean_gradients
+from naibu.identification.from_fields.forward.forward_model import Observed, whitening
+from naibu.identification.from_fields.forward.load_cases import Zones
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, young_and_poisson
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, first_point, search
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.point_location import locate
 
-DECISIVE = 16.0  # of twice the logarithm of a ratio of likelihoods: four standard deviations of a normal score
-ALIKE = 36.0  # the same of readings that may be right as well: changes are of first order, and found from a fit that is not theirs
+DECISIVE = 25.0  # of twice the logarithm of a ratio of likelihoods: five standard deviations of a normal score
+ALIKE = 36.0  # the same of readings that may be right as well: what another law explains is only known roughly
+PROBES = 32  # random signs that estimate how much of the noise a surface follows: of a thousand components to one hundredth
 REVERSED, PLACED_LATER = "all displacements reversed", "displacements that stand where points came to lie"
-
-CHECK = "the fields fit far better with {}: check signs, and that vectors stand at points of the reference scan"
+EXCHANGED = "the reference and the deformed scan exchanged"
+READINGS = {REVERSED: (0.0, -1.0), PLACED_LATER: (-1.0, 1.0), EXCHANGED: (1.0, -1.0)}  # vectors that are added to points, and their sign
+ROUGHLY = SearchSettings(max_iterations=10, tolerance=1e-3)
+MOST_LOST = 0.4  # of the points, that another reading may put outside of the body: where it puts more there it is none
+ON_SURFACE = 1e-6  # mm
+CHECK = (
+    "the fields fit far better with {}{}: check signs, and that vectors stand at points of the reference scan and lead to the deformed one"
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -40,10 +52,10 @@ class Reading:
     text : str
         In words.
     theta : ndarray, shape (2 count,)
-        By how much it would change ln mu and ln(kappa / mu) of the zones, to first order.
+        By how much it would change ln mu and ln(kappa / mu) of the zones.
     gain : float
-        Twice the logarithm of its likelihood over that of the fields as they are, or of small strain if that is more: a field that was
-        computed at small strain lies half-way to the reversed one.
+        Twice the logarithm of its likelihood over that of the fields as they are, or of small strain or another law if that is more: a
+        field that was computed at small strain lies half-way to the reversed one.
     """
 
     text: str
@@ -51,79 +63,126 @@ class Reading:
     gain: float
 
 
-def other_readings(at: Linearised, quadratic: Concentrated, variance: float) -> tuple[Reading, ...]:
+def other_readings(model: FieldModel, best: Point, of_law: float, variance: float, bounds: Bounds) -> tuple[Reading, ...]:
     """Return the readings of fields of a body in space; none where small strain was assumed, or is so small that it changes nothing.
 
     Parameters
     ----------
-    at, quadratic : Linearised, Concentrated
-        At the best fit.
+    model : FieldModel
+    best : Point
+        The best fit of the fields as they are.
+    of_law : float
+        By how much chi squared falls with the shape of the law free.
     variance : float
-        Of whitened residuals, errors that neighbours share counted.
+        Of whitened residuals over that stated, errors that neighbours share counted.
+    bounds : Bounds
+        Of the moduli.
     """
-    model = at.model
-    if model.law.linear or largest_strain(model, at.point.states) < LEAST_STRAIN:
+    if model.law.linear or largest_strain(model, best.states) < LEAST_STRAIN:
         return ()
-    straight = _of_small_strain(at)
-    if straight is None:
-        return ()
-    given, small, *others = [
-        refitted(at, quadratic, changes)
-        for changes in ([np.zeros_like(c) for c in straight], straight, [2.0 * c for c in straight], _of_placed_later(at))
-    ]
-    before = min(_misfit(at, given), _misfit(at, small))
-    pairs = zip((REVERSED, PLACED_LATER), others, strict=True)
-    return tuple(Reading(text, refit.theta - given.theta, (before - _misfit(at, refit)) / variance) for text, refit in pairs)
+    small = _fitted(model.with_law("linear"), best.theta, best.states, bounds)
+    otherwise = 0.0 if small is None else small.misfit - best.misfit
+    other_law, out = min(0.0, otherwise, -of_law), []
+    before = _excess(model, best)
+    for text, (shift, sign) in READINGS.items():
+        report_progress(model.progress, f"comparing with {text}")
+        moved = [_placed(model.mesh, o, u, shift, sign) for o, u in zip(model.observed, best.states, strict=True)]
+        if any(kept.mean() < 1.0 - MOST_LOST for _, kept in moved):
+            continue
+        other = _measured_as(model, [field for field, _ in moved])
+        found = _fitted(other, best.theta, [sign * u for u in best.states], bounds)
+        if found is None:
+            continue
+        as_it_is = before if shift == 0.0 else _excess(model, best, [kept for _, kept in moved])
+        out.append(Reading(text, found.theta - best.theta, (as_it_is + other_law - _excess(other, found)) / variance))
+    return tuple(out)
 
 
-def judged_readings(judged: Verdict, found: Sequence[Reading]) -> Verdict:
-    """Return the verdict with the readings that fit better than the fields as they are, and in a note those that fit as well."""
-    better = [f"{one.text} (chi squared falls by {one.gain:.3g})" for one in found if one.gain > DECISIVE]
+def likelier(found: Sequence[Reading]) -> tuple[Reading, ...]:
+    """Return the readings that fit far better than the fields as they are, and about as well as the best of them, the best first."""
+    best = max((one.gain for one in found), default=0.0)
+    return tuple(sorted((one for one in found if one.gain > max(DECISIVE, best - DECISIVE)), key=lambda one: -one.gain))
+
+
+def covariance_of_readings(found: Sequence[Reading], size: int) -> FloatArray:
+    """Return what readings that are likelier leave in doubt of logarithms (size, size): by as much as these change them."""
+    return np.asarray(sum((np.outer(one.theta, one.theta) for one in likelier(found)), np.zeros((size, size))))
+
+
+def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, theta: FloatArray) -> Verdict:
+    """Return the verdict with the readings that fit far better than the fields as they are first, and in a note those that fit as well."""
     alike = [one.text for one in found if -ALIKE <= one.gain <= DECISIVE]
     if alike:
         told = f"The fields would fit as well with {' or '.join(alike)}: that they are neither is taken for given."
         judged = replace(judged, notes=(*judged.notes, told.replace("neither", "not") if len(alike) == 1 else told))
+    better = likelier(found)
     if not better:
         return judged
     part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
-    return replace(judged, explanation=part, reasons=(CHECK.format(" or ".join(better)), *judged.reasons))
+    texts = " or ".join(f"{one.text} (chi squared falls by {one.gain:.3g})" for one in better)
+    changes = told_changes(zones, np.log(young_and_poisson(theta + better[0].theta)[0] / young_and_poisson(theta)[0]))
+    why = CHECK.format(texts, f", which would make Young's modulus another one ({changes})" if changes else "")
+    reasons = (reason for reason in judged.reasons if not reason.startswith(DOES_NOT_FIT))  # this explains more than another law
+    return replace(judged, explanation=part, reasons=(why, *reasons))
 
 
-def _of_small_strain(at: Linearised) -> list[FloatArray] | None:
-    """Return by how much whitened residuals (q,) change, the loaded nodes moving as they do; None without equilibrium at small strain."""
-    model = at.model
-    law = field_law(model.computed, "linear", averaged=model.averaged)
-    lame, shear = moduli_of(model.zones, at.point.theta)
-    solvers, out = Solvers(law, model.points), []
+def _fitted(model: FieldModel, theta: FloatArray, near: Sequence[FloatArray], bounds: Bounds) -> Point | None:
+    """Return the best fit from some moduli and a motion near by; None where no equilibrium is found."""
     try:
-        for o, u in zip(model.observed, at.point.states, strict=True):
-            state, _ = equilibrium(law, solvers, lame, shear, o.load_case, u, b"")
-            out.append(np.asarray(o.operator @ (state - u).ravel()))
+        return search(model, _start(model, theta, near), Objective(bounds=bounds), ROUGHLY, progress=model.progress).point
     except ConvergenceError:
         return None
+
+
+def _excess(model: FieldModel, point: Point, kept: Sequence[BoolArray] | None = None) -> float:
+    """Return by how much chi squared exceeds what noise alone leaves, of some points (k,).
+
+    The surface follows some of the noise, the more the fewer points there are near it: by random signs (:cite:p:`bekas2007`). The weak
+    prior on its motion says nothing of readings, which differ in strain.
+    """
+    at = model.linearised(model.evaluate(point.theta, point.states))
+    rng = np.random.default_rng(2)
+    signs = [rng.choice([-1.0, 1.0], size=(len(o.data), PROBES)) for o in model.observed]
+    pulled = at.adjoint([o.operator.T @ z for o, z in zip(model.observed, signs, strict=True)])[1]
+    moved = at.forward(None, at.loaded_solved(pulled))
+    total = 0.0
+    for t, (o, u, z) in enumerate(zip(model.observed, moved, signs, strict=True)):
+        free = ((z - np.asarray(o.operator @ u)) ** 2).mean(axis=1)
+        counted = (o.residual(point.states[t]) ** 2 - free).reshape(-1, o.load_case.field.points.shape[1])
+        total += float(counted.sum() if kept is None else counted[kept[t]].sum())
+    return total
+
+
+def _start(model: FieldModel, theta: FloatArray, near: Sequence[FloatArray]) -> Point:
+    try:
+        return model.evaluate(theta, near)
+    except ConvergenceError:
+        return first_point(model, theta)
+
+
+def _measured_as(model: FieldModel, fields: Sequence[DisplacementField]) -> FieldModel:
+    """Return the model of other measurements at about the same points, with solvers, and for a beginning preconditioners, of a model."""
+    out, n = copy(model), model.mesh.n_points  # the first nodes are those of the mesh
+    before = [replace(o.load_case, loaded=o.load_case.loaded[:n], external_force=o.load_case.external_force[:n]) for o in model.observed]
+    cases = [replace(case, field=field) for case, field in zip(before, fields, strict=True)]
+    out.observed = tuple(Observed.of(model.mesh, model.computed, case) for case in cases)
+    out.boundary = model.boundary.copied()
     return out
 
 
-def _of_placed_later(at: Linearised) -> list[FloatArray]:
-    """Return by how much whitened residuals (q,) change where vectors belong to the points from which they lead; none from outside."""
-    return [_moved_back(at, o, u) for o, u in zip(at.model.observed, at.point.states, strict=True)]
+def _placed(mesh: Mesh, o: Observed, u: FloatArray, shift: float, sign: float) -> tuple[DisplacementField, BoolArray]:
+    """Return a field as another reading has it, of the points (k,) that it keeps within the body.
 
-
-def _moved_back(at: Linearised, o: Observed, u: FloatArray) -> FloatArray:
+    Noise n moves the points as well: with the deformation gradient F of the reading, a vector misses the displacement at its point by F n.
+    """
     field = o.load_case.field
     points, vectors = field.points[field.valid], field.vectors[field.valid]
-    mesh = at.model.computed
-    here, there = (locate(mesh, p, tolerance_mm=np.inf) for p in (points, points - vectors))
-    rows = np.repeat(np.arange(len(points)), here.weights.shape[1])
-    change = np.zeros_like(vectors)
-    for found, sign in ((there, 1.0), (here, -1.0)):
-        shape = (len(points), mesh.n_points)
-        change += sign * np.asarray(sp.csr_matrix((found.weights.ravel(), (rows, mesh.cells[found.cells].ravel())), shape=shape) @ u)
-    change[there.distance_mm > 0.0] = 0.0
-    return np.asarray(np.einsum("nij,nj->ni", whitening(field, o.load_case.name)[0], change).ravel())
-
-
-def _misfit(at: Linearised, refit: Refit) -> float:
-    """Return the misfit with the weak prior on the motion of the loaded nodes."""
-    motions = [o.sought(u + moved) for o, u, moved in zip(at.model.observed, at.point.states, refit.moved, strict=True)]
-    return refit.misfit + sum(float(b @ (o.prior @ b)) for o, b in zip(at.model.observed, motions, strict=True))
+    whiten = whitening(field, o.load_case.name)[0]
+    covariance = np.linalg.inv(whiten @ whiten)
+    if shift:
+        gradient = mean_gradients(mesh, u)[0][locate(mesh, points, tolerance_mm=np.inf).cells]
+        deformed = np.linalg.inv(np.eye(3) + shift * gradient)
+        covariance = deformed @ covariance @ np.swapaxes(deformed, 1, 2)
+        points = points + shift * vectors
+    kept = np.asarray(locate(mesh, points, tolerance_mm=np.inf).distance_mm <= ON_SURFACE)
+    return DisplacementField.from_arrays(points[kept], sign * vectors[kept], covariance=covariance[kept]), kept

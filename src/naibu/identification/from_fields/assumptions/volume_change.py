@@ -82,7 +82,7 @@ def volume_change(mesh: Mesh, load_case: FieldLoadCase) -> VolumeChange:
     load_case : FieldLoadCase
         What was measured.
     """
-    gradient, weight = _gradients(mesh, load_case.field)
+    gradient, weight = mean_gradients(mesh, nearest_interpolated(mesh, load_case.field))
     unit = np.eye(3)
     flips = [np.diag(np.where(np.arange(3) == k, -1.0, 1.0)) for k in range(3)]  # two signs are the negative of the third
     signs = [np.array([1.0, *rest]) for rest in product((1.0, -1.0), repeat=2)]
@@ -97,18 +97,18 @@ def _beyond_noise(mesh: Mesh, field: DisplacementField, weight: FloatArray) -> f
     """Return the change of volume over that of shape from products of what two halves of the points say: their noise is independent."""
     drawn = np.random.default_rng(0).permutation(np.flatnonzero(field.valid))
     everything = np.arange(len(field.valid))
-    one, other = (_gradients(mesh, replace(field, valid=np.isin(everything, half)))[0] for half in (drawn[::2], drawn[1::2]))
+    halves = (replace(field, valid=np.isin(everything, half)) for half in (drawn[::2], drawn[1::2]))
+    one, other = (mean_gradients(mesh, nearest_interpolated(mesh, half))[0] for half in halves)
     shape = float(np.average((_deviator(one) * _deviator(other)).sum(axis=(1, 2)), weights=weight))
     change = min(float(np.average(_dilatation(sign * one) * _dilatation(sign * other), weights=weight)) for sign in (1.0, -1.0))
     return float(np.sqrt(max(change, 0.0) / shape)) if shape > 0.0 else 0.0
 
 
-def _gradients(mesh: Mesh, field: DisplacementField) -> tuple[FloatArray, FloatArray]:
-    """Return the mean gradient of the displacement in every cell (m, 3, 3), and the volumes of the cells (m,), mm^3."""
-    nodes = nearest_interpolated(mesh, field)
+def mean_gradients(mesh: Mesh, u: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the mean gradient of a displacement (n, 3), mm, in every cell (m, 3, 3), and the volumes of the cells (m,), mm^3."""
     discrete = elements(mesh, "standard")
     volume = discrete.weights.sum(axis=1)
-    return np.einsum("mq,mai,mqaj->mij", discrete.weights, nodes[mesh.cells], discrete.gradients) / volume[:, None, None], volume
+    return np.einsum("mq,mai,mqaj->mij", discrete.weights, u[mesh.cells], discrete.gradients) / volume[:, None, None], volume
 
 
 def _share(gradient: FloatArray, weight: FloatArray, matrix: FloatArray) -> float:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
 from naibu.identification.from_fields.inversion.gauss_newton import Objective
@@ -47,36 +47,49 @@ class CorrectedScore:
         Of all logarithms there.
     value : ndarray, shape (2 count,)
         Gradient of the objective, the motion of the surface eliminated, without what its prior and the noise add to it in the mean.
+    free : ndarray, shape (2 count,), bool
+        Logarithms inside of their bounds, or that it leads back from there. Others are held.
     """
 
     at: Linearised
     quadratic: Concentrated
     value: FloatArray
+    free: BoolArray
 
     @classmethod
-    def of(cls, at: Linearised, quadratic: Concentrated, variance: float) -> CorrectedScore:
+    def of(cls, at: Linearised, quadratic: Concentrated, variance: float, objective: Objective | None = None) -> CorrectedScore:
         """Find it; `variance` is that of the residuals over that stated: beyond 1 it may be that of errors of the model, not of noise."""
         explained = [-o.residual(u) for o, u in zip(at.model.observed, at.point.states, strict=True)]
         of_prior = quadratic.hessian @ change_of_fit(at, quadratic, explained)
-        return cls(at, quadratic, of_prior + 0.5 * min(variance, 1.0) * slope_of_informed(at))
+        value = of_prior + 0.5 * min(variance, 1.0) * slope_of_informed(at)
+        return cls(at, quadratic, value, (objective or Objective()).free(at.point.theta, value))
 
     @property
     def step(self) -> FloatArray:
         """Change (2 count,) of the logarithms that would make it vanish, by no more than a standard deviation of each."""
-        inverse = np.linalg.pinv(self.quadratic.hessian, rcond=1e-12)
+        inverse = np.linalg.pinv(self._hessian, rcond=1e-12)
         sd = np.sqrt(np.abs(np.diag(inverse)))
-        return np.asarray(np.clip(-inverse @ self.value, -sd, sd))
+        return self._all(np.clip(-inverse @ self.value[self.free], -sd, sd))
 
     @property
     def is_short(self) -> bool:
         """Whether derivatives after that step are about those before it."""
-        sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(self.quadratic.hessian, rcond=1e-12))))
-        return bool((np.abs(self.step) <= SHORT * sd).all())
+        sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(self._hessian, rcond=1e-12))))
+        return bool((np.abs(self.step[self.free]) <= SHORT * sd).all())
+
+    @property
+    def _hessian(self) -> FloatArray:
+        return self.quadratic.hessian[np.ix_(self.free, self.free)]
 
     def left(self, information: CorrectedInformation) -> FloatArray:
         """Return the bias (2 count,) that moduli still have, by the information without that of noise; one standard deviation at most."""
         sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(information.matrix))))
-        return np.asarray(np.clip(information.step(self.value), -sd, sd))
+        return np.where(self.free, np.clip(information.step(np.where(self.free, self.value, 0.0)), -sd, sd), 0.0)
+
+    def _all(self, of_free: FloatArray) -> FloatArray:
+        out = np.zeros(len(self.free))
+        out[self.free] = of_free
+        return out
 
 
 def without_bias(model: FieldModel, best: Point, objective: Objective, variance: float) -> CorrectedScore:
@@ -95,11 +108,10 @@ def without_bias(model: FieldModel, best: Point, objective: Objective, variance:
     """
     at = model.linearised(best)
     quadratic = at.concentrated(np.eye(2 * model.zones.count))
-    quadratic = replace(quadratic, gradient=np.zeros_like(quadratic.gradient))  # but for rounding, and for bounds
-    score = CorrectedScore.of(at, quadratic, variance)
     low, high = objective.bounds.box(model.zones.count)
-    if ((best.theta <= low + 1e-9) | (best.theta >= high - 1e-9)).any():
-        return score
+    bounded = (best.theta <= low) | (best.theta >= high)
+    quadratic = replace(quadratic, gradient=np.where(bounded, quadratic.gradient, 0.0))  # elsewhere there is none but for rounding
+    score = CorrectedScore.of(at, quadratic, variance, objective)
     for _ in range(MOST_STEPS):
         if score.is_short:
             break
@@ -111,7 +123,7 @@ def without_bias(model: FieldModel, best: Point, objective: Objective, variance:
             at = model.linearised(model.evaluate(here.theta, here.states))
             return replace(score, at=at)
         at = model.linearised(further)
-        score = CorrectedScore.of(at, at.concentrated(np.eye(2 * model.zones.count)), variance)
+        score = CorrectedScore.of(at, at.concentrated(np.eye(2 * model.zones.count)), variance, objective)
     return score
 
 
