@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Generator
 from pathlib import Path
 
-import numba
 import pytest
 from threadpoolctl import threadpool_limits
 from virtual_press import COARSE, KNOWN, Press, virtual_press, write_press
@@ -16,18 +15,15 @@ from naibu._numba.process_lock import ProcessLock
 from naibu.workflows.markers import identify
 
 LONGEST_WAIT_S = 900.0
-KERNELS = ("_numba", "imaging", "mechanics", "simulation")  # whose tests are those of kernels, on all their threads
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Let linear algebra have one thread in each worker, and in what tests start, unless the user wants it otherwise, and kernels too.
+def pytest_configure() -> None:
+    """Let linear algebra have one thread in each worker, and in what tests start, unless the user wants it otherwise.
 
-    Workers fill the cores: threads of small matrices would wait for one another by computing. Kernels have their threads all the same in
-    tests of their own (`kernel_threads`); these wait asleep. In others two threads took a tenth more of the processor's time than one.
+    Workers fill the cores: threads of small matrices would wait for one another by computing. Kernels have their threads all the same;
+    these wait asleep.
     """
-    if getattr(config, "workerinput", {}).get("workercount", 1) > 1:
-        numba.set_num_threads(1)  # of the main thread
     if not any(variable in os.environ for variable in THREADS):
         os.environ.update(dict.fromkeys(THREADS, "1"))
         threadpool_limits(1, user_api="blas")  # what is loaded already
@@ -44,16 +40,6 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.freeze()
         gc.enable()
-
-
-@pytest.fixture(scope="module", autouse=True)
-def kernel_threads(request: pytest.FixtureRequest) -> Generator[None]:
-    """Let kernels have all their threads in tests of their own, where workers otherwise have one."""
-    fewer = numba.get_num_threads()
-    if request.path.relative_to(Path(__file__).parent).parts[0] in KERNELS:
-        numba.set_num_threads(numba.config.NUMBA_NUM_THREADS)
-    yield
-    numba.set_num_threads(fewer)
 
 
 @pytest.fixture(scope="session")
