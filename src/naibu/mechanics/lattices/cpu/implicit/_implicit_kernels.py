@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from naibu._numba.compilation import COUNTED, UNCOUNTED, njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu._numba.intrinsics.simd import WIDTH, load, splat, store
 from naibu._numba.thread_pool import begin_step, end_step
 from naibu.mechanics.lattices.cpu.contact._operator import FACES, ROOM, add_contact
@@ -31,70 +31,53 @@ SETUP = 6  # work of a step beside its iterations, in iterations
 
 
 @njit(cache=True, **UNCOUNTED)
-def turn_about(inertia, spin):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Turn the angular momentum `spin` (3,) of nodes about their centre into their angular velocity; `inertia` (3, 3) is lost.
+def angular_velocity(xx, yy, zz, xy, xz, yz, s0, s1, s2):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the angular velocity of a rigid body from its inertia tensor and angular momentum about its centre, by cofactors.
 
-    The largest pivots first, by Gauss and Jordan. Nodes in a line, which may turn about it as fast as they like, do so at some speed.
+    Nodes in a line may turn about it as fast as they like, and have the same inertia about all that is normal to it.
     """
-    largest = max(inertia[0, 0], inertia[1, 1], inertia[2, 2])
-    left = 7  # bits of the rows that were not taken yet
-    for _ in range(3):
-        k, pivot = -1, 1e-12 * largest
-        for a in range(3):
-            if left & (1 << a) and inertia[a, a] > pivot:
-                k, pivot = a, inertia[a, a]
-        if k < 0:
-            break
-        left -= 1 << k
-        for b in range(3):
-            inertia[k, b] /= pivot
-        spin[k] /= pivot
-        for a in range(3):
-            if a != k:
-                factor = inertia[a, k]
-                for b in range(3):
-                    inertia[a, b] -= factor * inertia[k, b]
-                spin[a] -= factor * spin[k]
-    for a in range(3):
-        if left & (1 << a):
-            spin[a] = 0.0
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    d, e, f = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    normal = 0.5 * (xx + yy + zz)
+    determinant = xx * a + xy * b + xz * c
+    if determinant > 1e-12 * normal * normal * normal:
+        return (
+            (a * s0 + b * s1 + c * s2) / determinant,
+            (b * s0 + d * s1 + e * s2) / determinant,
+            (c * s0 + e * s1 + f * s2) / determinant,
+        )
+    if normal > 0.0:
+        return s0 / normal, s1 / normal, s2 / normal
+    return 0.0, 0.0, 0.0
 
 
-@njit(cache=True, **COUNTED)
+@njit(cache=True, **UNCOUNTED)
 def rigid_part(x, mass, impulse, out):  # type: ignore[no-untyped-def]  # pragma: no cover
     """Set `out` to the rigid motion that has the momenta of an impulse (3 pad,)."""
     pad = len(mass)
-    centre, p, spin, inertia = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((3, 3))
-    weight = 0.0
+    weight, c0, c1, c2, p0, p1, p2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(pad):
-        weight += mass[i]
-        for a in range(3):
-            centre[a] += mass[i] * x[a * pad + i]
-            p[a] += impulse[a * pad + i]
-    for a in range(3):
-        centre[a] /= weight
+        m = mass[i]
+        weight += m
+        c0, c1, c2 = c0 + m * x[i], c1 + m * x[pad + i], c2 + m * x[2 * pad + i]
+        p0, p1, p2 = p0 + impulse[i], p1 + impulse[pad + i], p2 + impulse[2 * pad + i]
+    c0, c1, c2 = c0 / weight, c1 / weight, c2 / weight
+    s0, s1, s2, xx, yy, zz, xy, xz, yz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(pad):
-        if mass[i] > 0.0:
-            d0, d1, d2 = x[i] - centre[0], x[pad + i] - centre[1], x[2 * pad + i] - centre[2]
+        m = mass[i]
+        if m > 0.0:
+            d0, d1, d2 = x[i] - c0, x[pad + i] - c1, x[2 * pad + i] - c2
             f0, f1, f2 = impulse[i], impulse[pad + i], impulse[2 * pad + i]
-            spin[0] += d1 * f2 - d2 * f1
-            spin[1] += d2 * f0 - d0 * f2
-            spin[2] += d0 * f1 - d1 * f0
-            inertia[0, 0] += mass[i] * (d1 * d1 + d2 * d2)
-            inertia[1, 1] += mass[i] * (d0 * d0 + d2 * d2)
-            inertia[2, 2] += mass[i] * (d0 * d0 + d1 * d1)
-            inertia[0, 1] -= mass[i] * d0 * d1
-            inertia[0, 2] -= mass[i] * d0 * d2
-            inertia[1, 2] -= mass[i] * d1 * d2
-    inertia[1, 0], inertia[2, 0], inertia[2, 1] = inertia[0, 1], inertia[0, 2], inertia[1, 2]
-    turn_about(inertia, spin)
-    w = spin
+            s0, s1, s2 = s0 + d1 * f2 - d2 * f1, s1 + d2 * f0 - d0 * f2, s2 + d0 * f1 - d1 * f0
+            xx, yy, zz = xx + m * (d1 * d1 + d2 * d2), yy + m * (d0 * d0 + d2 * d2), zz + m * (d0 * d0 + d1 * d1)
+            xy, xz, yz = xy - m * d0 * d1, xz - m * d0 * d2, yz - m * d1 * d2
+    w0, w1, w2 = angular_velocity(xx, yy, zz, xy, xz, yz, s0, s1, s2)
     for i in range(pad):
-        d0, d1, d2 = x[i] - centre[0], x[pad + i] - centre[1], x[2 * pad + i] - centre[2]
+        d0, d1, d2 = x[i] - c0, x[pad + i] - c1, x[2 * pad + i] - c2
         alive = 1.0 if mass[i] > 0.0 else 0.0
-        out[i] = alive * (p[0] / weight + w[1] * d2 - w[2] * d1)
-        out[pad + i] = alive * (p[1] / weight + w[2] * d0 - w[0] * d2)
-        out[2 * pad + i] = alive * (p[2] / weight + w[0] * d1 - w[1] * d0)
+        out[i] = alive * (p0 / weight + w1 * d2 - w2 * d1)
+        out[pad + i] = alive * (p1 / weight + w2 * d0 - w0 * d2)
+        out[2 * pad + i] = alive * (p2 / weight + w0 * d1 - w1 * d0)
 
 
 @njit(cache=True, fastmath=_FAST, **UNCOUNTED)
