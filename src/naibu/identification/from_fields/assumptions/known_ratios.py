@@ -72,7 +72,7 @@ def asked_ratios(
     model, out = at.model, []
     given = refitted(at, quadratic, [np.zeros(len(o.data)) for o in model.observed])
     left = _left(at, given)
-    errors = np.zeros_like(left)
+    errors, most = np.zeros_like(left), np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
     if finer is not None:
         pairs = zip(model.observed, at.point.states, finer, strict=True)
         errors = _left(at, refitted(at, quadratic, [r - o.residual(u) for o, u, r in pairs])) - left
@@ -92,7 +92,7 @@ def asked_ratios(
         stated, other = (_compressibility(nu) for nu in (region.poisson_ratio, near))
         part = (max(stated + score / size * (other - stated), _compressibility(MAX_POISSON_RATIO)) - stated) / (other - stated)
         asked = _poisson_ratio(stated + part * (other - stated))
-        theta = part * stretch * (changed.theta - given.theta)
+        theta = np.clip(part * stretch * (changed.theta - given.theta), -most, most)
         one = AskedRatio(region.name, region.poisson_ratio, asked, float(chdtrc(1, score**2 / size / variance)), theta)
         matters = np.abs(_change(one, at.point.theta)).max(initial=0.0) > MODULUS
         if one.probability < UNLIKELY and matters and abs(asked - one.stated) > STATED_SD * region.poisson_ratio_sd:
@@ -119,9 +119,7 @@ def judged_ratios(judged: Verdict, found: Sequence[AskedRatio], zones: Zones, th
 
 def doubt_of_ratios(found: Sequence[AskedRatio], size: int) -> FloatArray:
     """Return what stated ratios that fields contradict add to the second moment (size, size) of errors of theta."""
-    most = np.repeat([np.inf, MOST_OF_RATIO], size // 2)
-    shifts = [np.clip(one.theta, -most, most) for one in found]
-    return np.asarray(sum((np.outer(shift, shift) for shift in shifts), np.zeros((size, size))))
+    return np.asarray(sum((np.outer(one.theta, one.theta) for one in found), np.zeros((size, size))))
 
 
 def _change(one: AskedRatio, theta: FloatArray) -> FloatArray:
