@@ -22,6 +22,7 @@ from naibu.identification.from_fields.assumptions.assumed_law import (
     warned,
 )
 from naibu.identification.from_fields.assumptions.free_law import FreeLaw
+from naibu.identification.from_fields.assumptions.known_ratios import DOES_NOT_FIT as RATIO_DOES_NOT_FIT
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones
@@ -46,14 +47,14 @@ def found(law: str, seed: int = 1) -> FieldEstimate:
     return identified(table[:, :3], table[:, columns[law]], seed)
 
 
-def identified(points: FloatArray, u: FloatArray, seed: int = 1) -> FieldEstimate:
+def identified(points: FloatArray, u: FloatArray, seed: int = 1, poisson: float = POISSON_RATIO) -> FieldEstimate:
     """Identify the upper half of the cube from displacements (k, 3), mm, at points (k, 3), mm, to which noise is added."""
     mesh = box((60.0,) * 3, (8, 8, 8), layers=[("soft", 30.0), ("hard", 30.0)], centred=True)
     sd = 0.01 * float(np.linalg.norm(u, axis=1).max())
     noisy = u + sd * np.random.default_rng(seed).standard_normal(u.shape)
     field = DisplacementField.from_arrays(points, noisy, sd_mm=sd)
     plates = np.abs(np.abs(mesh.points[:, 2] - mesh.points[:, 2].mean()) - 30.0) < 1e-9
-    zones = Zones.of(mesh, known={"soft": (SOFT, POISSON_RATIO)})
+    zones = Zones.of(mesh, known={"soft": (SOFT, poisson)})
     return identify_field(mesh, [FieldLoadCase.of("pressed", field, mesh, loaded=plates)], zones, law="neo_hookean")
 
 
@@ -165,3 +166,15 @@ def test_with_the_law_free_no_ratio_leaves_the_range_of_searches() -> None:
     free = estimate.free_law
     assert estimate.poisson_ratio[0] == pytest.approx(MAX_POISSON_RATIO) and free is not None and free.settled
     assert free.shift[1] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_a_wrong_poisson_ratio_of_a_known_gel_is_told_with_what_the_field_asks_for_and_counted() -> None:
+    """With 0.49 for 0.45 of the soft gel the hard one would come out a sixth too soft."""
+    table = np.loadtxt(Path(__file__).with_name("two_gels.csv"), delimiter=",", skiprows=1)
+    wrong, right = identified(table[:, :3], table[:, 3:6], poisson=0.49), found("neo_hookean")
+    assert wrong.verdict is not None and right.verdict is not None
+    assert wrong.verdict.explanation is Explanation.IN_PART
+    assert f"{RATIO_DOES_NOT_FIT}: fields ask for some 0.45 instead of 0.49 of 'soft'" in wrong.verdict.sentence
+    assert RATIO_DOES_NOT_FIT not in right.verdict.sentence
+    low, high = wrong.intervals()[0][0]
+    assert low < HARD < high

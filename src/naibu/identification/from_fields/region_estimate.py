@@ -10,6 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumed_law
+from naibu.identification.from_fields.assumptions.known_ratios import asked_ratios, doubt_of_ratios, judged_ratios
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
 from naibu.identification.from_fields.assumptions.other_readings import covariance_of_readings, judged_readings, other_readings
 from naibu.identification.from_fields.field_estimate import FieldEstimate
@@ -83,10 +84,13 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     model, found = fit.model, _Measured.of(fit, settings)
     others = assumptions(found.at, found.quadratic, settings.law, found.stretch, settings.borders)
     of_known = covariance_of(others, len(found.size.theta))
-    free, law = assumed_law.with_law_free(found.at, None if found.size.shift is None else found.size.residuals, fit.freedom, found.stretch)
+    finer = None if found.size.shift is None else found.size.residuals
+    free, law = assumed_law.with_law_free(found.at, finer, fit.freedom, found.stretch)
+    variance = found.shared * max(1.0, found.misfit / fit.freedom)
+    ratios = asked_ratios(found.at, found.quadratic, finer, variance, found.stretch)
     judged, thin = _judged(fit, found, settings)
     of_elements, coarse = _of_elements(fit, found, settings, judged, thin)
-    total = found.of_noise.with_added(of_known).with_law(law)
+    total = found.of_noise.with_added(of_known + doubt_of_ratios(ratios, len(of_known))).with_law(law)
     total = total if of_elements is None else total.with_added(of_elements)
     unsaid = np.repeat([0.0, 0.0 if tells_poisson(model) else AT_BOUND], model.zones.count)
     at_bounds = settings.bounds.doubt_at(found.size.theta)
@@ -96,9 +100,9 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     by_elements = None if of_elements is None else replace(found.of_noise, covariance=of_elements).of_young_and_poisson(theta)[0]
     known = found.size.shift is not None and found.size.alike
     judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total, elements_known=known)
-    variance = found.shared * max(1.0, found.misfit / fit.freedom)
     readings = other_readings(model, fit.point, 0.0 if free is None else free.fall, variance, settings.bounds)
     judged = judged_readings(judged, readings, model.zones, theta)
+    judged = judged_ratios(judged, ratios, model.zones, theta)
     total = total.with_added(covariance_of_readings(readings, len(theta)))
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))

@@ -150,12 +150,16 @@ def _named(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} other zone{'s' if len(names) > 2 else ''}"
 
 
+def other_poisson_ratio(poisson: float) -> float:
+    """Return a Poisson's ratio near another one, by which the effect of not knowing it is found."""
+    near = min(poisson + OTHER_POISSON, 0.5 * (poisson + 0.5), MOST_POISSON)
+    return near if near - poisson >= 1e-3 else poisson - OTHER_POISSON
+
+
 def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
     """Return text, Young's modulus, Poisson's ratio and distance in standard deviations of other moduli of a region."""
     young, poisson = region.young_modulus, region.poisson_ratio
-    near = min(poisson + OTHER_POISSON, 0.5 * (poisson + 0.5), MOST_POISSON)
-    if near - poisson < 1e-3:
-        near = poisson - OTHER_POISSON
+    near = other_poisson_ratio(poisson)
     of_young = OTHER_YOUNG / region.young_modulus_sd if region.young_modulus_sd > 0.0 else 0.0
     of_poisson = abs(near - poisson) / region.poisson_ratio_sd if region.poisson_ratio_sd > 0.0 else 0.0
     stiffer = (1.0 + OTHER_YOUNG) * young
@@ -167,15 +171,25 @@ def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
 
 def _refitted(at: Linearised, quadratic: Concentrated, law: FieldLaw, lame: FloatArray, shear: FloatArray) -> FloatArray | None:
     """Return the change (2 count,) of theta when equilibrium is that of other moduli or another law; None where there is none."""
-    model = at.model
-    solvers, changes = Solvers(law, model.points), []
     try:
-        for o, u in zip(model.observed, at.point.states, strict=True):
-            state, _ = equilibrium(law, solvers, lame, shear, o.load_case, u, b"")
-            changes.append(np.asarray(o.operator @ (state - u).ravel()))
-        return change_of_fit(at, quadratic, changes)
+        return change_of_fit(at, quadratic, changes_under(at, law, lame, shear))
     except ConvergenceError:
         return None
+
+
+def changes_under(at: Linearised, law: FieldLaw, lame: FloatArray, shear: FloatArray) -> list[FloatArray]:
+    """Return by how much whitened residuals (q,) change with other moduli (m,), kPa, or another law, the loaded nodes moving as they do.
+
+    Raises
+    ------
+    ConvergenceError
+        There is no equilibrium.
+    """
+    solvers, changes = Solvers(law, at.model.points), []
+    for o, u in zip(at.model.observed, at.point.states, strict=True):
+        state, _ = equilibrium(law, solvers, lame, shear, o.load_case, u, b"")
+        changes.append(np.asarray(o.operator @ (state - u).ravel()))
+    return changes
 
 
 def _with_border(at: Linearised, quadratic: Concentrated, law: LawName, points: FloatArray) -> FloatArray | None:

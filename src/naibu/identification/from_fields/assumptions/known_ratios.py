@@ -1,0 +1,153 @@
+"""Whether fields speak against the Poisson's ratio that was stated of a known region.
+
+How a known region deforms depends on its Poisson's ratio, and with a wrong one its neighbours come out too stiff or too soft with small
+standard errors. Its Young's modulus sets the scale, and no field tells it; its Poisson's ratio shows in the field. To first order in
+mu / kappa of the region, moduli and the motion of the loaded nodes following, the ratio that fits best is found, and by how much it fits
+better (a score test, :cite:t:`rao1948`). Errors of elements resemble another ratio; how large they are is sought as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import chdtrc
+
+from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
+from naibu.core.parameters import MAX_POISSON_RATIO
+from naibu.identification.from_fields.assumptions.assumed_law import MODULUS, UNLIKELY
+from naibu.identification.from_fields.assumptions.other_assumptions import changes_under, other_poisson_ratio
+from naibu.identification.from_fields.forward.load_cases import Zones
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
+from naibu.identification.from_fields.mesh_error import Refit, refitted
+from naibu.identification.verdict import Explanation, Verdict
+from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
+
+STATED_SD = 2.0  # stated standard deviations of a ratio within which another one is no contradiction
+MOST_OF_RATIO = 1.0  # change of ln(kappa / mu) that counts: near incompressibility it may be any, to first order
+DOES_NOT_FIT = "a stated Poisson's ratio does not fit"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AskedRatio:
+    """The Poisson's ratio of a known region that fits best, and what it would do.
+
+    Attributes
+    ----------
+    region : str
+        Its name.
+    stated, asked : float
+        Poisson's ratios.
+    probability : float
+        Of so large a score by chance.
+    theta : ndarray, shape (2 count,)
+        By how much ln mu and ln(kappa / mu) of the zones would change, to first order.
+    """
+
+    region: str
+    stated: float
+    asked: float
+    probability: float
+    theta: FloatArray
+
+
+def asked_ratios(
+    at: Linearised, quadratic: Concentrated, finer: Sequence[FloatArray] | None, variance: float, stretch: FloatArray
+) -> tuple[AskedRatio, ...]:
+    """Return the ratios of known regions that fields contradict by more than is stated of them, and that matter.
+
+    Parameters
+    ----------
+    at, quadratic : Linearised, Concentrated
+        At the best fit.
+    finer : sequence of ndarray, shape (q,), or None
+        Whitened residuals of every load case on elements of half the size; None where these were not computed.
+    variance : float
+        Of whitened residuals, errors that neighbours share counted.
+    stretch : ndarray, shape (2 count,)
+        By how much changes of logarithms are larger at vanishing element size.
+    """
+    model, out = at.model, []
+    given = refitted(at, quadratic, [np.zeros(len(o.data)) for o in model.observed])
+    left = _left(at, given)
+    errors, most = np.zeros_like(left), np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
+    if finer is not None:
+        pairs = zip(model.observed, at.point.states, finer, strict=True)
+        errors = _left(at, refitted(at, quadratic, [r - o.residual(u) for o, u, r in pairs])) - left
+    for number, region in enumerate(model.zones.known):
+        lame, shear = moduli_of(model.zones, at.point.theta)
+        cells, near = model.zones.region_of_cell == number, other_poisson_ratio(region.poisson_ratio)
+        lame[cells], shear[cells] = lame_parameters(region.young_modulus, near)
+        try:
+            changed = refitted(at, quadratic, changes_under(at, model.law, lame, shear))
+        except ConvergenceError:
+            continue
+        slope = _beside(_left(at, changed) - left, errors)
+        size = _product(slope, slope)
+        if not size > 0.0:
+            continue
+        score = -_product(left, slope)
+        stated, other = (_compressibility(nu) for nu in (region.poisson_ratio, near))
+        part = (max(stated + score / size * (other - stated), _compressibility(MAX_POISSON_RATIO)) - stated) / (other - stated)
+        asked = _poisson_ratio(stated + part * (other - stated))
+        theta = np.clip(part * stretch * (changed.theta - given.theta), -most, most)
+        one = AskedRatio(region.name, region.poisson_ratio, asked, float(chdtrc(1, score**2 / size / variance)), theta)
+        matters = np.abs(_change(one, at.point.theta)).max(initial=0.0) > MODULUS
+        if one.probability < UNLIKELY and matters and abs(asked - one.stated) > STATED_SD * region.poisson_ratio_sd:
+            out.append(one)
+    return tuple(out)
+
+
+def judged_ratios(judged: Verdict, found: Sequence[AskedRatio], zones: Zones, theta: FloatArray) -> Verdict:
+    """Return the verdict with the ratios that fields contradict."""
+    if not found:
+        return judged
+    each = []
+    for one in found:
+        change = _change(one, theta)
+        i = int(np.argmax(np.abs(change)))
+        much = f"{100.0 * abs(np.expm1(change[i])):.0f} % {'higher' if change[i] > 0.0 else 'lower'}"
+        each.append(
+            f"fields ask for some {one.asked:.2g} instead of {one.stated:.3g} of {one.region!r}, with which Young's modulus of "
+            f"{zones.names[i]} would be {much}"
+        )
+    part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
+    return replace(judged, explanation=part, reasons=(f"{DOES_NOT_FIT}: {'; '.join(each)}", *judged.reasons))
+
+
+def doubt_of_ratios(found: Sequence[AskedRatio], size: int) -> FloatArray:
+    """Return what stated ratios that fields contradict add to the second moment (size, size) of errors of theta."""
+    return np.asarray(sum((np.outer(one.theta, one.theta) for one in found), np.zeros((size, size))))
+
+
+def _change(one: AskedRatio, theta: FloatArray) -> FloatArray:
+    """Return the change of ln E (count,) of the zones."""
+    return np.asarray(np.log(young_and_poisson(theta + one.theta)[0] / young_and_poisson(theta)[0]))
+
+
+def _left(at: Linearised, refit: Refit) -> FloatArray:
+    """Return what a refit leaves (2, n): whitened residuals and the motion of the loaded nodes, that in the second row times its prior."""
+    motions = [o.sought(u + moved) for o, u, moved in zip(at.model.observed, at.point.states, refit.moved, strict=True)]
+    dual = [o.prior @ b for o, b in zip(at.model.observed, motions, strict=True)]
+    return np.stack([np.concatenate([*refit.residuals, *motions]), np.concatenate([*refit.residuals, *dual])])
+
+
+def _product(one: FloatArray, other: FloatArray) -> float:
+    return float(one[0] @ other[1])
+
+
+def _beside(rows: FloatArray, errors: FloatArray) -> FloatArray:
+    """Return rows (2, n) without what resembles errors of elements."""
+    size = _product(errors, errors)
+    return np.asarray(rows - _product(errors, rows) / size * errors) if size > 0.0 else rows
+
+
+def _compressibility(poisson: float) -> float:
+    """Return mu / kappa."""
+    return 3.0 * (1.0 - 2.0 * poisson) / (2.0 * (1.0 + poisson))
+
+
+def _poisson_ratio(compressibility: float) -> float:
+    return (3.0 - 2.0 * compressibility) / (6.0 + 2.0 * compressibility)
