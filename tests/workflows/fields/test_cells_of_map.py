@@ -12,7 +12,7 @@ from naibu.core.volume import Volume
 from naibu.io.displacement_fields import write_field
 from naibu.io.images import write_volume
 from naibu.validation.specimens.quadratic_body import QuadraticBody
-from naibu.workflows.fields.cells_of_map import FEWEST, LEAST_OF_MAP, NOISE_OF_STRAIN, cubes_of_map
+from naibu.workflows.fields.cells_of_map import FEWEST, LEAST_OF_MAP, NOISE_OF_STRAIN, cubes_of_map, noise_mm
 from naibu.workflows.fields.identify_fields import identify_fields
 from naibu.workflows.fields.object_on_cubes import ScannedObject
 
@@ -46,6 +46,14 @@ def test_precise_fields_have_as_many_cubes_as_before_and_none_fewer_than_a_few()
     assert not told and usual.mesh.n_cells >= LEAST_OF_MAP
     fewest, told = cubes_of_map(scanned(0.02, 0.4, 900), 900)
     assert told and 0.8 * FEWEST < fewest.mesh.n_cells < 2 * FEWEST
+
+
+def test_noise_that_is_not_stated_is_found_whatever_the_size_of_cubes() -> None:
+    """Of fewer points than cubes, a thousandth of the largest displacement was called their scatter, ten times too little."""
+    noisy = scanned(0.1, 0.12, 900, stated=False, seed=4)
+    for cells in (200, 1000, 2000):
+        (case,) = noisy.on_cubes(noisy.edge_mm(cells), (), exactly=True, each_cell=False).load_cases
+        assert noise_mm(case) == pytest.approx(0.12, rel=0.1)
 
 
 def test_a_map_of_a_noisy_field_is_right_or_says_that_it_cannot_tell(tmp_path: Path) -> None:

@@ -208,13 +208,12 @@ def identify_fields(
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     scanned = ScannedObject(inside, labels, names, tuple((Path(p).stem, f) for p, f in zip(paths, read, strict=True)), tuple(loaded))
     points = max(int(field.valid.sum()) for field in read)
-    usual = max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS)
-    size = element_size_mm or scanned.edge_mm(usual)
+    size = element_size_mm or scanned.edge_mm(max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS))
     sought = () if each_cell else set(names.values()) - set(stated.values)
     if not each_cell:
         scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0, known=stated.not_rigid)
         sought, stated = set(sought) & set(scanned.names.values()), stated.without(set(names.values()) - set(scanned.names.values()))
-        size = element_size_mm or scanned.edge_mm(usual)
+        size = element_size_mm or scanned.edge_mm(max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS))
     if each_cell and not element_size_mm:
         cubes, longer = cubes_of_map(scanned, points)
     else:

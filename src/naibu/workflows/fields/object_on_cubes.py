@@ -30,6 +30,7 @@ from naibu.workflows.fields.measured_load_case import measured_load_case
 from naibu.workflows.fields.thin_coverings import Covering, loaded_below, mesh_on_what_is_left, without_thin_coverings
 
 MOST_REFINED = 2800  # cells that are made unasked where smaller ones change moduli: beyond, the time grows with the square of their number
+POINTS_THAT_TELL = 2  # a cube, from which neighbours tell noise: the nodes of smaller ones follow it
 WORTHWHILE = 0.85  # of the edge length: refinement by less changes little
 HALF = 0.5  # of it: the least by which cells are made smaller at once
 UNRESOLVED = (
@@ -110,12 +111,27 @@ class ScannedObject:
             all_measured = [replace(case, loaded=case.loaded | below[:, None]) for case in all_measured]
         cases, outliers = zip(*map(without_contradicted, all_measured), strict=True)
         words = tuple(text for told in outliers for text in told)
-        noisy = [with_noise_of_neighbours(mesh, case) for case in cases]
+        noisy = [self._with_noise(mesh, case) for case in cases]
         words += tuple(text for case, factor in noisy for text in _told_noise(case, factor))
         coarser = [(case, 0.0) if each_cell else with_representation_error(mesh, case) for case, _ in noisy]
         words += tuple(UNRESOLVED.format(case.name, 100 * part) for case, part in coarser if part > 0.0)
         within = region_in(self.inside, self.labels, self.names) if not each_cell and ends_within(wrong, lost) else None
         return ObjectOnCubes(self, mesh, cell_of_voxel, tuple(case for case, _ in coarser), words, left_out, wrong, lost, within)
+
+    def _with_noise(self, mesh: Mesh, case: FieldLoadCase) -> tuple[FieldLoadCase, float]:
+        """Return a load case with the noise that neighbours show; where none is stated, with few points for the cubes, in larger ones."""
+        points = int(case.field.valid.sum())
+        if case.field.covariance is not None or points >= POINTS_THAT_TELL * mesh.n_cells:
+            return with_noise_of_neighbours(mesh, case)
+        body = replace(self, labels=(self.inside.values != 0).astype(np.int64), names={1: "body"}, covering=None)
+        edge = self.edge_mm(max(points // (2 * POINTS_THAT_TELL), 1))
+        larger = body.on_cubes(edge, (), exactly=True, each_cell=True)
+        found = next(one.field.covariance for one in larger.load_cases if one.name == case.name)
+        if found is None:
+            return with_noise_of_neighbours(mesh, case)
+        alike = np.broadcast_to(found.mean(axis=0), (len(case.field.points), *found.shape[1:]))
+        field = case.field
+        return replace(case, field=DisplacementField.from_arrays(field.points, field.vectors, covariance=alike, valid=field.valid)), np.nan
 
     def _misplaced(self, mesh: Mesh, cell_of_voxel: IntArray) -> tuple[float, float, dict[str, float]]:
         """Return which parts of the object cubes leave out and assign to another zone, and which part of every zone is not its cubes'."""
