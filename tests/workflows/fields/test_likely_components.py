@@ -105,7 +105,7 @@ def test_a_wrong_sign_is_a_doubt_where_forces_may_act_anywhere(
 
 
 def test_another_order_of_what_may_be_a_sponge_is_a_doubt() -> None:
-    told = told_doubt(VolumeChange(0.71, 0.5, 0.12, 1, np.eye(3)[[2, 1, 0]]))
+    told = told_doubt(VolumeChange(0.71, 0.5, 0.12, 0.71, 1, np.eye(3)[[2, 1, 0]]))
     assert "changes 0.71 times as much as the shape" in told and "0.12 times" in told
     assert "take uz, uy, ux for ux, uy, uz" in told
 

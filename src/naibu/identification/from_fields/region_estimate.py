@@ -162,6 +162,7 @@ class _Measured:
         quadratic, point = score.quadratic, score.at.point
         noise = SurfaceNoise.of(score.at, quadratic, variance)
         size = _size(fit, settings, score.at, quadratic, noise)
+        size = replace(size, theta=np.where(score.free, size.theta, point.theta))  # how far beyond its bound one is, no fit says
         misfit = sum(float(r @ r) for r in size.residuals)
         factor = 1.0 if freedom <= 0.0 else max(1.0, float(np.sqrt(misfit / freedom)))
         of_noise = Uncertainty.of(noise.information.matrix, factor)
