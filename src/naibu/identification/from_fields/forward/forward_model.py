@@ -7,7 +7,7 @@ and the measured field constrains both.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.sparse as sp
@@ -34,6 +34,7 @@ NEWTON_TOLERANCE = 1e-9  # residual force over the force on the loaded nodes
 NEWTON_ITERATIONS = 12
 PATIENT_ITERATIONS = 30  # from a displacement that larger cells lend
 LONG_WAY = 30_000  # unknowns up to which equilibrium is sought from rest as well: twenty factorizations or more, minutes beyond
+MOST_FROM_REST = 100  # iterations on that path; most take twenty to forty
 HALVINGS = 6
 ITERATIVE_FROM = 30_000  # unknowns from which a body solved only once or twice is solved by iteration
 
@@ -256,8 +257,8 @@ def settled(
     """Return the displacement (n, d), mm, in equilibrium, with the loaded components as in `guess`, sought from there, then from rest.
 
     A displacement that larger cells lend to small ones is rough at borders of stiff zones and at a surface near incompressibility. Newton's
-    method overcomes that slowly or not at all. The path of the load from rest is then followed in bodies of up to `LONG_WAY` unknowns; in
-    larger ones it took longer than all of an identification.
+    method overcomes that slowly or not at all. The path of the load from rest is then followed in bodies of up to `LONG_WAY` unknowns, by
+    `MOST_FROM_REST` iterations; larger ones, and continuation where Newton's method fails again, took longer than all of an identification.
 
     Raises
     ------
@@ -269,14 +270,23 @@ def settled(
     except ConvergenceError:
         if points.size > LONG_WAY:
             raise
-        start = loaded_from_rest(law, points, lame, shear, load_case, guess)
+        start = loaded_from_rest(law, points, lame, shear, load_case, guess, at_length=False)
         return equilibrium(law, solvers, lame, shear, load_case, np.where(load_case.loaded, guess, start), b"")[0]
 
 
 def loaded_from_rest(
-    law: FieldLaw, points: FloatArray, lame: FloatArray, shear: FloatArray, load_case: FieldLoadCase, moved: FloatArray
+    law: FieldLaw,
+    points: FloatArray,
+    lame: FloatArray,
+    shear: FloatArray,
+    load_case: FieldLoadCase,
+    moved: FloatArray,
+    *,
+    at_length: bool = True,
 ) -> FloatArray:
     """Return the displacement (n, d), mm, in equilibrium under a finite-strain law, the loaded components moved in steps to `moved` (n, d).
+
+    Where it is not sought `at_length`, the path ends after `MOST_FROM_REST` iterations or where Newton's method fails on short steps.
 
     Raises
     ------
@@ -287,4 +297,7 @@ def loaded_from_rest(
         return moved
     values = np.where(load_case.loaded, moved, 0.0)
     problem = Problem(points, law.assembler(lame, shear), (), PrescribedDisplacement(load_case.loaded, values), load_case.external_force)
-    return solve(problem, settings=SolverSettings(first_step=0.2, largest_step=0.5, tolerance=1e-8)).displacement
+    settings = SolverSettings(first_step=0.2, largest_step=0.5, tolerance=1e-8)
+    if not at_length:
+        settings = replace(settings, max_total_iterations=MOST_FROM_REST, pseudo_transient=False)
+    return solve(problem, settings=settings).displacement
