@@ -21,7 +21,7 @@ from naibu.simulation.lattice_cut import LatticeCut
 
 CUT_STAGES = ("separating the mesh", "bringing volume strains to balance", "factorizing the stiffness", "lifting the tool")
 PART = 0.1  # of a step, in which volume strains come to balance
-SHARES = (1.0, 0.5, 0.25)  # of the way to that balance that are tried where the body has moved on since it was found
+SHARES = (0.0, 0.25, 0.5, 1.0)  # of the way to that balance that are tried, as the body may have moved on since it was found
 
 
 @dataclass(slots=True, eq=False)
@@ -139,10 +139,7 @@ def _share_that_helps(body: FiniteElementBody, at: FloatArray, settled: FloatArr
         wrong[body.supported] = 0.0
         return float(wrong.sum()) if smallest > 0.0 else np.inf
 
-    without = left(0.0)
-    ends = {share: left(share) for share in SHARES}
-    best = min(SHARES, key=ends.__getitem__)
-    return best if ends[best] < without else 0.0
+    return min(SHARES, key=left)
 
 
 def _settled(body: FiniteElementBody, behind: DynamicState) -> FloatArray:

@@ -29,8 +29,8 @@ COARSER = (
 )
 
 
-def cubes_of_map(scanned: ScannedObject, points: int) -> tuple[ObjectOnCubes, tuple[str, ...]]:
-    """Return the object on cubes that a map has by default, and in words where noise makes them larger.
+def cubes_of_map(scanned: ScannedObject, points: int, edge_mm: float = 0.0) -> tuple[ObjectOnCubes, tuple[str, ...]]:
+    """Return the object on the cubes of a map, and in words where noise makes those that it has by default larger.
 
     Parameters
     ----------
@@ -38,7 +38,11 @@ def cubes_of_map(scanned: ScannedObject, points: int) -> tuple[ObjectOnCubes, tu
         The object.
     points : int
         Measurements in the field that has most.
+    edge_mm : float
+        Of the cubes; 0 chooses it.
     """
+    if edge_mm:
+        return scanned.on_cubes(edge_mm, (), exactly=True, each_cell=True), ()
     usual = min(CELLS_OF_MAP, max(LEAST_OF_MAP, points))
     cubes = scanned.on_cubes(scanned.edge_mm(usual), (), exactly=False, each_cell=True)
     whole = replace(scanned, labels=(scanned.inside.values != 0).astype(np.int64), names={1: "body"})

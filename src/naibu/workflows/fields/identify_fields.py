@@ -38,14 +38,9 @@ from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Cell, Table
-from naibu.workflows.fields.block_mesh import (
-    CELLS,
-    blurred,
-    labelled_object,
-    names_of_labels,
-    sizes_of_voxels,
-)
+from naibu.workflows.fields.block_mesh import blurred, labelled_object, names_of_labels, sizes_of_voxels
 from naibu.workflows.fields.cells_of_map import cubes_of_map
+from naibu.workflows.fields.cells_of_zones import POINTS_OF_CELL, cubes_of_zones
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
 from naibu.workflows.fields.likely_components import require_likely_components
 from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, placed_on_scan, relative_deformation
@@ -60,7 +55,6 @@ if TYPE_CHECKING:
 FILES = ("model.json", "report.html", "zones.mha", "young_modulus.mha", "young_modulus_sd.mha", "poisson_ratio.mha", "identification.json")
 MOST_CARDS = 4
 NO_VALUE = np.nan, 0.0, np.inf, np.nan, -1.0, 0.5  # Young's modulus, Poisson's ratio, and their bounds, of a zone that is left out
-POINTS_OF_CELL, LEAST_CELLS = 2, 64  # cells with fewer points leave to the motion of the surface what zones of uniform moduli would tell
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,19 +199,15 @@ def identify_fields(
     read = [placed_on_scan(field, spacing_mm, inside) for field in read]
     names = names_of_labels(labels, inside, zone_names or {})
     given = stated = _stated(known, list(names.values()), each_cell=each_cell)
-    longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     scanned = ScannedObject(inside, labels, names, tuple((Path(p).stem, f) for p, f in zip(paths, read, strict=True)), tuple(loaded))
     points = max(int(field.valid.sum()) for field in read)
-    size = element_size_mm or scanned.edge_mm(max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS))
-    sought = () if each_cell else set(names.values()) - set(stated.values)
-    if not each_cell:
-        scanned = scanned.without_thin_coverings(size, sought, exactly=element_size_mm > 0.0, known=stated.not_rigid)
-        sought, stated = set(sought) & set(scanned.names.values()), stated.without(set(names.values()) - set(scanned.names.values()))
-        size = element_size_mm or scanned.edge_mm(max(min(CELLS, points // POINTS_OF_CELL), LEAST_CELLS))
-    if each_cell and not element_size_mm:
-        cubes, longer = cubes_of_map(scanned, points)
+    longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
+    if each_cell:
+        cubes, noisy = cubes_of_map(scanned, points, element_size_mm)
+        longer += noisy
     else:
-        cubes = scanned.on_cubes(size, sought, exactly=element_size_mm > 0.0, each_cell=each_cell)
+        cubes, stated = cubes_of_zones(scanned, points, element_size_mm, stated)
+    scanned = cubes.scanned
     folder = None if out is None else output_folder(out, FILES, overwrite=overwrite)
     doubts, untold = require_likely_components(scanned, points, stated, progress) if check_components else ((), ())
     if stated is NOTHING_KNOWN:

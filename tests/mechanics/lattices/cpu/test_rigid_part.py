@@ -25,8 +25,9 @@ def momenta(points: FloatArray, impulse: FloatArray) -> FloatArray:
     ids=["cloud", "turned cloud", "turned plate", "line", "line along x"],
 )
 def test_it_is_rigid_and_has_the_momenta(points: FloatArray, rank: int) -> None:
-    mass = np.array([*RNG.uniform(0.5, 2.0, len(points)), 0.0])  # the last is a place to fill up
-    impulse = RNG.normal(size=(len(points), 3))
+    rng = np.random.default_rng(4)
+    mass = np.array([*rng.uniform(0.5, 2.0, len(points)), 0.0])  # the last is a place to fill up
+    impulse = rng.normal(size=(len(points), 3))
     padded, x, out = (np.zeros((3, len(mass))) for _ in range(3))
     padded[:, :-1], x[:, :-1] = impulse.T, points.T
     rigid_part(x.ravel(), mass, padded.ravel(), out.ravel())

@@ -82,7 +82,7 @@ def asked_ratios(
         lame[cells], shear[cells] = lame_parameters(region.young_modulus, near)
         try:
             changed = refitted(at, quadratic, changes_under(at, model.law, lame, shear))
-        except ConvergenceError:
+        except ConvergenceError:  # a body so far from equilibrium with another ratio is none that a first order could judge
             continue
         slope = _beside(_left(at, changed) - left, errors)
         size = _product(slope, slope)
