@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import product
 
@@ -85,6 +86,22 @@ def test_neighbours_share_what_is_not_noise() -> None:
     assert smooth.shared_mm == pytest.approx(smooth.rms_mm, rel=0.15)
     both = case(noise=3.0, shared=1.0)
     assert both.shared_mm == pytest.approx(smooth.shared_mm, rel=0.35)
+
+
+@pytest.mark.parametrize(("off_mm", "explanation"), [(0.0, Explanation.EXPLAINED), (0.45, Explanation.EXPLAINED), (1.2, Explanation.IN_PART)])
+def test_where_neighbours_are_off_together_is_said(off_mm: float, explanation: Explanation) -> None:
+    """A corner of eight markers of 125, within the noise of the whole state."""
+    plain = case()
+    corner = np.all(LATTICE - [0.0, 0.0, 30.0] < -9.0, axis=1)
+    residual = plain.residual + off_mm * corner[:, None] * [0.0, 0.0, 1.0]
+    made = replace(plain, residual=residual)
+    found = judged(made)
+    assert corner.sum() == 8 and made.noise_factor < 2.0 and found.explanation is explanation
+    told = " ".join((*found.reasons, *found.notes))
+    place = re.search(r"around \((.*), (.*), (.*)\) mm are off by .* mm along z together", told)
+    assert (place is not None) == (off_mm > 0.0)
+    if place is not None:
+        np.testing.assert_allclose([float(v) for v in place.groups()], [-15.0, -15.0, 15.0], atol=2.0)
 
 
 def test_a_uniform_deformation_is_explained_but_tells_little() -> None:

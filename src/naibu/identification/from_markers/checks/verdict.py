@@ -2,7 +2,7 @@
 
 A search that converged has found a minimum, which says nothing about how low it is. The verdict weighs what tells data apart that the model
 cannot explain: the residuals in units of the noise, how much of the deformation they leave unexplained, whether an affine map does as well,
-the part of the residuals that neighbours share (noise is not shared), estimates far from what was known beforehand, heights of indenters
+the part of the residuals that neighbours share (noise is not shared), over a state and somewhere in it, estimates far from what was known beforehand, heights of indenters
 and layers that contradict the stated ones, experiments that contradict each other, and markers that ask for another law.
 """
 
@@ -22,6 +22,7 @@ from naibu.identification.from_markers.calibration import Calibration
 from naibu.identification.from_markers.checks.assumed_law import contradicted_law, hangs_on_law
 from naibu.identification.from_markers.checks.contradicting_experiments import contradicted_experiments
 from naibu.identification.from_markers.checks.layer_heights import LAYER, contradicted_layers
+from naibu.identification.from_markers.checks.local_residuals import LocalResidual, largest_local_residual
 from naibu.identification.from_markers.checks.marker_checks import Doubt, robust_affine
 from naibu.identification.from_markers.checks.marker_outliers import Outlier
 from naibu.identification.from_markers.law_uncertainty import LawUncertainty, law_uncertainty
@@ -35,6 +36,8 @@ NOISE_OVERSTATED = 0.5
 UNEXPLAINED = 0.4  # of the deformation left by a model that does not explain it
 NO_GAIN, WORSE = 0.95, 1.5  # residual over that of an affine map: nothing is gained; something is wrong even within the noise
 SHARED, SHARED_NOISE = 0.1, 1.5  # the part of the residual that neighbours share, over the deformation and over the noise
+# mean residual of a marker and its neighbours over its noise: worth a note, a flaw (of 375 means of noise alone, one set in 20 exceeds 3.7)
+LOCAL_NOTE, LOCAL_FLAW = 5.0, 8.0
 OFF_PRIOR, FAR_PRIOR, VERY_FAR_PRIOR = 3.0, 5.0, 10.0  # standard deviations of a prior: worth a note, a flaw, a grave one
 # difference of found and stated height over the stated compression: worth a note, a flaw, a grave one; and at least so many times the noise
 OFF_HEIGHT, FAR_HEIGHT, VERY_FAR_HEIGHT, HEIGHT_NOISE = 0.15, 0.5, 1.5, 3.0
@@ -106,6 +109,11 @@ class CaseEvidence:
         if len(self.points) <= NEIGHBOURS:
             return 0.0
         return float(np.sqrt(max(shared_part([(self.points, self.residual)]).square, 0.0)))
+
+    @property
+    def local(self) -> LocalResidual | None:
+        """Where neighbouring markers are off together most clearly; None where there are too few."""
+        return largest_local_residual(self.points, self.residual, self.sd, NEIGHBOURS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,7 +260,18 @@ def _fit_flaws(c: CaseEvidence) -> list[_Flaw]:
     if share > SHARED or c.shared_mm > SHARED_NOISE * c.noise_mm:
         text = f"neighbouring markers of {c.name} share residuals of {c.shared_mm:.2g} mm, {100 * share:.0f} % of the deformation"
         return [_Flaw(f"{text}, most {_worst_zone(c)}", share > UNEXPLAINED)]
+    if (local := c.local) is not None and local.times_noise > LOCAL_FLAW:
+        return [_Flaw(_off_together(c, local))]
     return []
+
+
+def _off_together(c: CaseEvidence, local: LocalResidual) -> str:
+    """Say where neighbouring markers are off together, and what may be the cause."""
+    at = ", ".join(f"{v:.0f}" for v in local.point)
+    return (
+        f"markers of {c.name} around ({at}) mm are off by {abs(local.mean_mm):.2g} mm along {'xyz'[local.axis]} together, "
+        f"{local.times_noise:.0f} times what noise explains: the model may lack something there, such as an inclusion, a void, a crack or a contact"
+    )
 
 
 def _height_flaws(c: CaseEvidence) -> list[_Flaw]:
@@ -301,6 +320,9 @@ def _notes(cases: Sequence[CaseEvidence], noise_factor: float, deviations: dict[
                 f"{c.name} is stated at {c.expected_mm:g} mm, but the markers put it at {c.found_mm:.1f} mm: check how it was measured, "
                 "since predictions at positions that were measured alike are off by as much."
             )
+        if (local := c.local) is not None and LOCAL_NOTE < local.times_noise <= LOCAL_FLAW and c.noise_factor < NOISE_EXPLAINED:
+            text = _off_together(c, local)
+            notes.append(f"{text[0].upper()}{text[1:]}.")
         if len(c.residual) and c.noise_factor < NOISE_EXPLAINED and c.rms_mm > 0.9 * c.affine_mm:
             notes.append(
                 f"An affine map describes {c.name} as well ({c.affine_mm:.2g} mm against {c.rms_mm:.2g} mm): "
