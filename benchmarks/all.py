@@ -29,6 +29,7 @@ COMMANDS: dict[str, tuple[str | None, str]] = {
     "rheology_speed": (None, "rheology_speed.py"),
     "accuracy": (None, "accuracy.py --record"),
     "interval_coverage": (None, "interval_coverage.py 16 --record"),
+    "marker_identification": (None, "marker_identification.py --record"),
     "prediction_coverage": (None, "interval_coverage.py 18 --predict --record"),
     "field_identification": (None, "field_identification.py coverage --repetitions 30 --record"),
     "lattice_calibration": (None, "lattice_calibration.py 5 --cells 3 --threads 1 --record"),
