@@ -1,8 +1,8 @@
 """Moduli from markers in bodies that FElupe compressed: ``python benchmarks/marker_identification.py`` (needs ``pip install felupe``).
 
-A block of two layers, 60 mm high, is compressed by 8 to 12 mm with 20-node hexahedra of another program; 125 markers move with it, and either scan adds
-0.15 mm of noise. `naibu.identify` is given the layers, the stated height and the modulus of the lower layer, 60 kPa. Some blocks are not what is
-stated of them. Two models then predict markers under 20 mm of compression.
+A block of two layers, 60 mm high, is compressed by 8 to 12 mm with 20-node hexahedra of another program; 125 markers move with it, and
+either scan adds 0.15 mm of noise. `naibu.identify` is given the layers, the stated height and the modulus of the lower layer. Some blocks
+are not what is stated of them. Two models then predict markers under 20 mm of compression.
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ PREDICTED_COLUMNS = ("block", "RMS, mm", "stated SD of a coordinate (median), mm
 def displaced(block: Block, markers: np.ndarray) -> np.ndarray:
     """Positions (k, 3), mm, of `markers` in the compressed block."""
     half, nodes = SIZE_MM / 2.0, CELLS + 1
-    mesh = felupe.Cube(a=(-half, -half, 0.0), b=(half, half, SIZE_MM), n=(nodes, nodes, nodes)).add_midpoints_edges(cell_type="hexahedron20")
+    cubes = felupe.Cube(a=(-half, -half, 0.0), b=(half, half, SIZE_MM), n=(nodes, nodes, nodes))
+    mesh = cubes.add_midpoints_edges(cell_type="hexahedron20")
     field = felupe.FieldContainer([felupe.Field(felupe.RegionQuadraticHexahedron(mesh), dim=3)])
     young = block.young_modulus(mesh.points[mesh.cells].mean(axis=1))[None, :]
     law = felupe.NeoHooke(mu=young / (2.0 * (1.0 + block.poisson_ratio)), bulk=young / (3.0 * (1.0 - 2.0 * block.poisson_ratio)))
@@ -85,13 +86,11 @@ def _held(block: Block, field: felupe.Field, points: np.ndarray) -> dict[str, fe
     base, pressed = np.isclose(points[:, 2], 0.0), np.isclose(points[:, 2], SIZE_MM)
     if block.bar:
         pressed &= np.abs(points[:, 0]) <= BAR_WIDTH_MM / 2.0 + 1e-9
-    vertical = {"base": felupe.Boundary(field, mask=base, skip=(1, 1, 0)), "pressed": felupe.Boundary(field, mask=pressed, skip=(1, 1, 0))}
-    if not block.sliding:
-        sticks = base | pressed
-        return vertical | {"sticks": felupe.Boundary(field, mask=sticks, skip=(0, 0, 1))}
-    centre = np.all(np.isclose(points, 0.0), axis=1)
-    edge = np.all(np.isclose(points, [SIZE_MM / 2.0, 0.0, 0.0]), axis=1)
-    return vertical | {"centre": felupe.Boundary(field, mask=centre, skip=(0, 0, 1)), "edge": felupe.Boundary(field, mask=edge, skip=(1, 0, 1))}
+    centre, edge = (np.all(np.isclose(points, p), axis=1) for p in ([0.0, 0.0, 0.0], [SIZE_MM / 2.0, 0.0, 0.0]))
+    along_xy, along_y, along_z = (0, 0, 1), (1, 0, 1), (1, 1, 0)  # what is not held is skipped
+    held = {"base": (base, along_z), "pressed": (pressed, along_z)}
+    held |= {"centre": (centre, along_xy), "edge": (edge, along_y)} if block.sliding else {"sticks": (base | pressed, along_xy)}
+    return {name: felupe.Boundary(field, mask=nodes, skip=skip) for name, (nodes, skip) in held.items()}
 
 
 def _interpolated(mesh: felupe.Mesh, values: np.ndarray, markers: np.ndarray) -> np.ndarray:
@@ -179,7 +178,8 @@ def main() -> None:
                 predictions.append(predicted(name, found, Path(folder) / str(number) / "deeper", rng))
                 print("  predicted: " + " | ".join(map(str, predictions[-1])), flush=True)
     if options.record:
-        write_record("marker_identification", [ResultTable("Moduli", COLUMNS, tuple(rows)), ResultTable("Predictions", PREDICTED_COLUMNS, tuple(predictions))])
+        tables = [ResultTable("Moduli", COLUMNS, tuple(rows)), ResultTable("Predictions", PREDICTED_COLUMNS, tuple(predictions))]
+        write_record("marker_identification", tables)
 
 
 if __name__ == "__main__":

@@ -88,7 +88,9 @@ def test_neighbours_share_what_is_not_noise() -> None:
     assert both.shared_mm == pytest.approx(smooth.shared_mm, rel=0.35)
 
 
-@pytest.mark.parametrize(("off_mm", "explanation"), [(0.0, Explanation.EXPLAINED), (0.45, Explanation.EXPLAINED), (1.2, Explanation.IN_PART)])
+@pytest.mark.parametrize(
+    ("off_mm", "explanation"), [(0.0, Explanation.EXPLAINED), (0.45, Explanation.EXPLAINED), (1.2, Explanation.IN_PART)]
+)
 def test_where_neighbours_are_off_together_is_said(off_mm: float, explanation: Explanation) -> None:
     """A corner of eight markers of 125, within the noise of the whole state."""
     plain = case()

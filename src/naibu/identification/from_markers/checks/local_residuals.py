@@ -1,7 +1,7 @@
-"""Where neighbouring markers are off together, by more than noise explains: an inclusion, a void or a crack that the model lacks shows like this.
+"""Where neighbouring markers are off together by more than noise explains.
 
-Residuals over a whole state hide it: a stiff inclusion of 22 mm in a gel of 60 mm doubles them at a sixth of the markers and leaves the others
-as they were. Means over each marker and its nearest ones are a local statistic of spatial association :cite:p:`anselin1995`.
+An inclusion, a void or a crack that the model lacks shows like this, while residuals over a whole state can hide it. Means over each
+marker and its nearest ones are a local statistic of spatial association :cite:p:`anselin1995`.
 """
 
 from __future__ import annotations

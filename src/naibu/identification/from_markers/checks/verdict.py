@@ -2,8 +2,9 @@
 
 A search that converged has found a minimum, which says nothing about how low it is. The verdict weighs what tells data apart that the model
 cannot explain: the residuals in units of the noise, how much of the deformation they leave unexplained, whether an affine map does as well,
-the part of the residuals that neighbours share (noise is not shared), over a state and somewhere in it, estimates far from what was known beforehand, heights of indenters
-and layers that contradict the stated ones, experiments that contradict each other, and markers that ask for another law.
+the part of the residuals that neighbours share (noise is not shared), over a state and somewhere in it, estimates far from what was known
+beforehand, heights of indenters and layers that contradict the stated ones, experiments that contradict each other, and markers that ask
+for another law.
 """
 
 from __future__ import annotations
@@ -270,7 +271,8 @@ def _off_together(c: CaseEvidence, local: LocalResidual) -> str:
     at = ", ".join(f"{v:.0f}" for v in local.point)
     return (
         f"markers of {c.name} around ({at}) mm are off by {abs(local.mean_mm):.2g} mm along {'xyz'[local.axis]} together, "
-        f"{local.times_noise:.0f} times what noise explains: the model may lack something there, such as an inclusion, a void, a crack or a contact"
+        f"{local.times_noise:.0f} times what noise explains: the model may lack something there, such as an inclusion, a void, a crack "
+        "or a contact"
     )
 
 
