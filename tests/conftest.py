@@ -4,6 +4,7 @@ import gc
 import os
 import pickle
 import shutil
+from collections import Counter
 from collections.abc import Generator
 from pathlib import Path
 
@@ -16,6 +17,21 @@ from naibu.workflows.markers import identify
 
 LONGEST_WAIT_S = 900.0
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+# Files that one worker begins with while another compiles what most others need, and those of few tests that take long: a worker that gets
+# one of them last works alone for as long.
+FIRST = ("test_warm_up.py", "test_house.py")
+LONG = (
+    "test_border_refinement.py",
+    "test_cells_of_map.py",
+    "test_layered_leg.py",
+    "test_mammography.py",
+    "test_particles_to_stiffness.py",
+    "test_self_test.py",
+    "test_sense_blocks_cluster.py",
+    "test_sensing_chip.py",
+    "test_tables.py",
+    "test_zones_within_cells.py",
+)
 
 
 def pytest_configure() -> None:
@@ -40,6 +56,14 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files in the order in which workers take them: those of `FIRST`, those of `LONG`, then those of most tests."""
+    count = Counter(item.path for item in items)
+    rank = {name: -2 for name in FIRST} | {name: -1 for name in LONG}
+    place = {path: (rank.get(path.name, 0), -count[path], k) for k, path in enumerate(count)}
+    items.sort(key=lambda item: place[item.path])
 
 
 @pytest.fixture(scope="session")
