@@ -61,7 +61,7 @@ def pytest_collection() -> Generator[None, object, object]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put files in the order in which workers take them: those of `FIRST`, those of `LONG`, then those of most tests."""
     count = Counter(item.path for item in items)
-    rank = {name: -2 for name in FIRST} | {name: -1 for name in LONG}
+    rank = dict.fromkeys(FIRST, -2) | dict.fromkeys(LONG, -1)
     place = {path: (rank.get(path.name, 0), -count[path], k) for k, path in enumerate(count)}
     items.sort(key=lambda item: place[item.path])
 

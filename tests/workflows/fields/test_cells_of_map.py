@@ -44,6 +44,8 @@ def test_noise_strains_a_cube_by_half_of_what_the_load_does(strain: float, noise
 def test_precise_fields_have_as_many_cubes_as_before_and_none_fewer_than_a_few() -> None:
     usual, told = cubes_of_map(scanned(0.1, 0.004, 900), 900)
     assert not told and usual.mesh.n_cells >= LEAST_OF_MAP
+    few, told = cubes_of_map(scanned(0.1, 0.004, 300), 300)
+    assert not told and few.mesh.n_cells == 729
     fewest, told = cubes_of_map(scanned(0.02, 0.4, 900), 900)
     assert told and 0.8 * FEWEST < fewest.mesh.n_cells < 2 * FEWEST
 
