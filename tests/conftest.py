@@ -21,16 +21,21 @@ THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 # one of them last works alone for as long.
 FIRST = ("test_warm_up.py", "test_house.py")
 LONG = (
+    "test_assumed_law.py",
     "test_border_refinement.py",
-    "test_cells_of_map.py",
+    "test_contradicting_experiments.py",
+    "test_correlate_blocks.py",
     "test_layered_leg.py",
+    "test_live_fingertip.py",
     "test_mammography.py",
+    "test_mesh_error.py",
+    "test_other_readings.py",
     "test_particles_to_stiffness.py",
+    "test_same_result.py",
     "test_self_test.py",
     "test_sense_blocks_cluster.py",
+    "test_sensing_chain.py",
     "test_sensing_chip.py",
-    "test_tables.py",
-    "test_zones_within_cells.py",
 )
 
 
