@@ -4,6 +4,7 @@ import gc
 import os
 import pickle
 import shutil
+from collections import Counter
 from collections.abc import Generator
 from pathlib import Path
 
@@ -16,6 +17,26 @@ from naibu.workflows.markers import identify
 
 LONGEST_WAIT_S = 900.0
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+# Files that one worker begins with while another compiles what most others need, and those of few tests that take long: a worker that gets
+# one of them last works alone for as long.
+FIRST = ("test_warm_up.py", "test_house.py")
+LONG = (
+    "test_assumed_law.py",
+    "test_border_refinement.py",
+    "test_contradicting_experiments.py",
+    "test_correlate_blocks.py",
+    "test_layered_leg.py",
+    "test_live_fingertip.py",
+    "test_mammography.py",
+    "test_mesh_error.py",
+    "test_other_readings.py",
+    "test_particles_to_stiffness.py",
+    "test_same_result.py",
+    "test_self_test.py",
+    "test_sense_blocks_cluster.py",
+    "test_sensing_chain.py",
+    "test_sensing_chip.py",
+)
 
 
 def pytest_configure() -> None:
@@ -40,6 +61,14 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put files in the order in which workers take them: those of `FIRST`, those of `LONG`, then those of most tests."""
+    count = Counter(item.path for item in items)
+    rank = dict.fromkeys(FIRST, -2) | dict.fromkeys(LONG, -1)
+    place = {path: (rank.get(path.name, 0), -count[path], k) for k, path in enumerate(count)}
+    items.sort(key=lambda item: place[item.path])
 
 
 @pytest.fixture(scope="session")

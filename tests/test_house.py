@@ -178,10 +178,13 @@ def text_files() -> list[Path]:
     return sorted(path for path in kept if path != Path(__file__).resolve())
 
 
-def loaded_by(statement: str) -> set[str]:
+def loaded_modules(statement: str) -> set[str]:
     command = [sys.executable, "-c", f"import sys; {statement}; print(*sys.modules)"]
-    names = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
-    return {name.partition(".")[0] for name in names} & set(ON_DEMAND)
+    return set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+
+
+def loaded_by(statement: str) -> set[str]:
+    return {name.partition(".")[0] for name in loaded_modules(statement)} & set(ON_DEMAND)
 
 
 def test_importing_naibu_is_light() -> None:
@@ -196,6 +199,13 @@ def test_importing_naibu_is_fast() -> None:
     timed = "from time import process_time; began = process_time(); import naibu; print(process_time() - began)"
     best = min(float(subprocess.run([sys.executable, "-c", timed], capture_output=True, text=True, check=True).stdout) for _ in range(5))
     assert best < 0.2
+
+
+def test_verbs_start_without_what_they_seldom_need() -> None:
+    """Statistics took a third of the start of each worker of a calibration."""
+    workflows = ("fields.identify_fields", "markers.identify", "measurement.sense", "studies.calibrate", "studies.simulate")
+    names = loaded_modules("import " + ", ".join(f"naibu.workflows.{name}" for name in workflows))
+    assert not {"scipy.stats", "scipy.signal"} & names
 
 
 def test_the_mechanics_load_no_plotting_and_no_command_line() -> None:

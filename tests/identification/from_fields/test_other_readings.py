@@ -40,13 +40,14 @@ from naibu.validation.specimens.quadratic_body import QuadraticBody
 PUSHES = {"pressed": (0.0, 0.0, -5.0), "pulled": (1.0, 0.0, 5.0), "sheared": (6.0, 0.0, -2.0)}
 OTHERS = {"reversed": REVERSED, "later": PLACED_LATER, "exchanged": EXCHANGED}
 SD_MM = 0.02
+CELLS, MORE_CELLS = 6, 8  # of the model along an edge; more where the body is of another law, or may be
 EXPLAINED = Verdict(Explanation.EXPLAINED, (), "residuals are 1 times the noise", 1.0, 0.0, 0.0)
 
 
 @cache
-def displaced(push: str) -> tuple[Mesh, FloatArray]:
-    """Return a cube of cells of 2.5 mm, its lower half softer, and how its nodes move, at finite strain."""
-    mesh = box([40.0] * 3, [16] * 3, centred=False)
+def displaced(push: str, cells: int) -> tuple[Mesh, FloatArray]:
+    """Return a cube of cells half as wide as the model's, its lower half softer, and how its nodes move, at finite strain."""
+    mesh = box([40.0] * 3, [2 * cells] * 3, centred=False)
     upper = (mesh.points[mesh.cells].mean(axis=1)[:, 2] > 20.0).astype(np.int64)
     mesh = Mesh.from_arrays(mesh.points, mesh.cells, "hexahedron", regions=upper, region_names=("unknown", "known"))
     materials = [material("neo_hookean", young_modulus=young, poisson_ratio=0.45) for young in (6.0, 12.0)]
@@ -57,17 +58,17 @@ def displaced(push: str) -> tuple[Mesh, FloatArray]:
 
 
 @cache
-def found(push: str, kind: str) -> FieldEstimate:
+def found(push: str, kind: str, cells: int = CELLS) -> FieldEstimate:
     """Identify the lower half of a cube, whose upper half is known, where forces may act on the whole surface."""
     rng = np.random.default_rng(11)
     points = rng.uniform(2.0, 38.0, (1200, 3))
     if kind == "small strain":
         points, u = QuadraticBody("cube", (6.0, 0.45), (12.0, 0.45)).solved(PUSHES[push], divisions=4).at(points / 40.0)
     else:
-        mesh, of_nodes = displaced(push)
+        mesh, of_nodes = displaced(push, cells)
         u = interpolation_operator(mesh, points) @ of_nodes
     u = u + SD_MM * rng.standard_normal(u.shape)
-    model = box([40.0] * 3, [8] * 3, centred=False)
+    model = box([40.0] * 3, [cells] * 3, centred=False)
     upper = (model.points[model.cells].mean(axis=1)[:, 2] > 20.0).astype(np.int64)
     model = Mesh.from_arrays(model.points, model.cells, "hexahedron", regions=upper, region_names=("unknown", "known"))
     if kind in ("later", "exchanged"):
@@ -83,7 +84,8 @@ def found(push: str, kind: str) -> FieldEstimate:
 @pytest.mark.parametrize("kind", ["right", "small strain"])
 @pytest.mark.parametrize("push", PUSHES)
 def test_a_true_field_is_not_accused(push: str, kind: str) -> None:
-    assert "fit far better" not in found(push, kind).identifiability[0]
+    cells = MORE_CELLS if kind == "small strain" else CELLS
+    assert "fit far better" not in found(push, kind, cells).identifiability[0]
 
 
 @pytest.mark.parametrize(
@@ -110,7 +112,7 @@ def test_another_reading_is_told_and_intervals_hold_the_moduli_that_are_right_th
 
 @pytest.mark.slow
 def test_what_another_law_explains_as_well_is_left_open() -> None:
-    one = found("pulled", "reversed")
+    one = found("pulled", "reversed", MORE_CELLS)
     assert "the law does not fit" in one.identifiability[0]
     assert "fit as well with all displacements reversed" in " ".join(one.identifiability)
 

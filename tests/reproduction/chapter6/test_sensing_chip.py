@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from naibu import datasets
 from naibu.applications.fingertip.fingertip import FingertipResolution
 from naibu.applications.sensing_chip.chip_mesh import ChipResolution
+from naibu.applications.sensing_chip.fillets import filleted_end
 from naibu.reproduction.agreement.read_tables import Tables
+from naibu.reproduction.chapter6 import sensing_chip
 from naibu.reproduction.chapter6.tables import chapter6
 from naibu.reproduction.chapters import AGREEMENT
 from naibu.viewer.chapters.chapter import Chapter
@@ -21,7 +25,9 @@ from naibu.viewer.tables import Table
 @pytest.fixture(scope="module")
 def chapter() -> Chapter:
     resolution = ChipResolution(along=6, across=1, through=2, below=2, frame=3)
-    return chapter6(resolution=resolution, fingertip_resolution=FingertipResolution(2, 2, 8))
+    with pytest.MonkeyPatch.context() as coarse:
+        coarse.setattr(sensing_chip, "filleted_end", partial(filleted_end, fineness=1))
+        return chapter6(resolution=resolution, fingertip_resolution=FingertipResolution(2, 2, 8))
 
 
 def table(chapter: Chapter, title: str) -> Table:

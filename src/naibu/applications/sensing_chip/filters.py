@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import brentq
-from scipy.signal import lfilter
 
 from naibu.core.arrays import FloatArray, require_positive, require_within
 from naibu.core.errors import InputError
@@ -31,6 +30,8 @@ def first_order_filter(readings: FloatArray, share: float) -> FloatArray:
     InputError
         Another share.
     """
+    from scipy.signal import lfilter  # slow to load, with all of scipy.stats
+
     r = _share(share)
     u = np.asarray(readings, dtype=float)
     return np.asarray(lfilter([r], [1.0, r - 1.0], u, axis=0, zi=(1.0 - r) * u[:1])[0])

@@ -244,7 +244,7 @@ def _costs(found: dict[str, Record], release: int) -> Table:
     rows: list[tuple[Cell, ...]] = []
     for name, r in found.items():
         parts = [float(np.mean(ms[part])) for part in (slice(release + 1), slice(release + 1, None)) for ms in (r.step_ms, r.adaptation_ms)]
-        rows.append((name, *parts, parts[0] / high))
+        rows.append((name, *parts, parts[0] / high if high > 0.0 else None))  # a coarse clock sees no time pass
     columns = (
         "model",
         "under the force: step, ms",

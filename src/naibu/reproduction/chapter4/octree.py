@@ -97,7 +97,7 @@ def _saving_rows(number: str, ours: Mapping[Cell, Sequence[float]]) -> tuple[tup
     for first, *cells in printed_table(number)[1]:
         found = ours.get(first)
         for k, kind in enumerate(KINDS):
-            saved = 100.0 * (1.0 - found[k] / found[0]) if found and k else None
+            saved = 100.0 * (1.0 - found[k] / found[0]) if found and k and found[0] > 0.0 else None  # a coarse clock sees no time pass
             rows.append((first, kind, cells[k], found[k] if found else None, cells[3 + k] if k else None, saved))
     return tuple(rows)
 

@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 from scipy.special import chdtri
-from scipy.stats import qmc
 
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError, WorkerLostError
@@ -75,6 +74,8 @@ def starting_values(unknowns: StudyUnknowns, count: int, seed: int) -> FloatArra
 
     They stay within the bounds of the unknowns.
     """
+    from scipy.stats import qmc  # slow to load, and not needed by workers
+
     stated = np.log(unknowns.start)
     unit = qmc.LatinHypercube(len(stated), seed=np.random.default_rng(seed)).random(count - 1) if count > 1 else np.zeros((0, len(stated)))
     low = np.maximum(stated - np.log(REACH), np.log(unknowns.bounds[:, 0]))

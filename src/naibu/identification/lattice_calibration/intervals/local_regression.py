@@ -18,8 +18,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg
-import scipy.stats
 from scipy.ndimage import uniform_filter1d
+from scipy.special import ndtri, stdtrit
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.evaluation import EvaluatedPoint
@@ -208,7 +208,7 @@ def _of_another(count: int) -> float:
     """
     if count < 2:
         return 0.0
-    quantile = float(scipy.stats.t.ppf(0.975, count - 1) / scipy.stats.norm.ppf(0.975))
+    quantile = float(stdtrit(count - 1, 0.975) / ndtri(0.975))
     return ((1.0 + 1.0 / count) * quantile**2 - 1.0) / (count - 1)
 
 

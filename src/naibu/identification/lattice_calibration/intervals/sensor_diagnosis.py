@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.stats
+from scipy.special import fdtrc
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.lattice_calibration.captured.sensor_errors import BodyResiduals, SensorErrors
@@ -124,7 +124,7 @@ def diagnosed(problem: StudyProblem, estimate: LatticeEstimate, found: Reproduce
         if more > 0 and errors.holds(problem.sensor_errors):
             ratio = (before.left - after.left) / more / (after.left / free)
             share = (before.left - after.left) / max(before.left - count, 1e-300)
-            if float(scipy.stats.f.sf(ratio, more, free)) < CHANCE and share > EXPLAINED:
+            if float(fdtrc(more, free, ratio)) < CHANCE and share > EXPLAINED:
                 fits.append((errors, after))
     if not fits:
         return None

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage, signal
+from scipy import ndimage
 
 from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
@@ -107,13 +107,15 @@ def _displacement(grid: SplineGrid, x_mm: FloatArray, shift: FloatArray) -> Floa
 
 def pull_of_parts(system: SplineSystem, pull: AnyFloatArray) -> FloatArray:
     """Return the work (NZ, NY, NX), on a part that swells by 1 about every node, of forces (n, 3) on the coefficients, times mm."""
+    from scipy.signal import fftconvolve  # slow to load, with all of scipy.stats
+
     grid, full = system.grid, np.zeros((*system.active.shape, 3))
     full[system.active] = pull
     # offsets of nodes from one another, z, y, x
     offsets = np.meshgrid(*[np.arange(1.0 - s, s) * h for s, h in zip(grid.shape, grid.step_mm[::-1], strict=True)], indexing="ij")
     moved = _cell_mm(grid) * _swelling(np.stack(offsets[::-1], axis=-1) / _cell_mm(grid))
     # the displacement is odd: what lies along an offset from the part has the part along the opposite one
-    return np.asarray(-sum(signal.fftconvolve(full[..., a], moved[..., a], mode="same") for a in range(3)))
+    return np.asarray(-sum(fftconvolve(full[..., a], moved[..., a], mode="same") for a in range(3)))
 
 
 def hidden_dilatation(

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from itertools import product
 
 import numpy as np
-from scipy.stats import qmc
 
 from naibu.core.arrays import FloatArray
 from naibu.io.study_schemas.sweep_schema import ParameterTable, SweepFile
@@ -24,6 +23,8 @@ def design(sweep: SweepFile) -> FloatArray:
     sweep : SweepFile
         Checked contents of the file.
     """
+    from scipy.stats import qmc  # slow to load, and not needed by workers
+
     tables = sweep.parameter
     if sweep.sweep.method == "grid":
         return np.array(list(product(*(_levels(table) for table in tables))), dtype=float)

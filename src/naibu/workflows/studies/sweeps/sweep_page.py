@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.stats import spearmanr
 
 from naibu.core.arrays import FloatArray
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
@@ -136,6 +135,8 @@ def _broken(key: str) -> str:
 
 
 def _correlations(rows: SweepRows, varied: list[int]) -> Table:
+    from scipy.stats import spearmanr  # slow to load, and not needed by workers
+
     lines: list[tuple[Cell, ...]] = []
     for k in varied:
         figures = rows.figures[rows.computed, k]
