@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
 BLOCK = 256  # right-hand sides solved together
 BOUNDARY_TOLERANCE, ROUGH_TOLERANCE = 1e-5, 1e-3  # relative residuals; the latter within a search: Hessians err by its square
-DENSE, PROBES = 1200, 64  # components up to which their Hessian is made as a full matrix; random vectors that tell a trace beyond
-SPARSE_COST = 0.1  # of that of a full matrix: what a sparse system costs, whatever the size of a body
+DENSE = 1600  # components up to which their Hessian is made as a full matrix
+EXACT_TRACE, PROBES = 1200, 64  # components up to which a trace is computed as it is; random vectors that estimate it beyond
+SPARSE_COST = 0.2  # of that of a full matrix: what a sparse system costs at most
 SPARSE_LIMIT = 40_000  # displacements: the factorization then takes a gigabyte
 FIXED = 1e-13  # of the largest eigenvalue, from which measurements tell the motion of all patches of loaded nodes
 BOUNDARY_ITERATIONS = 200
@@ -157,7 +158,7 @@ class _WithEquilibrium:
 def _with_equilibrium(o: Observed, stiffness: sp.bsr_matrix) -> _WithEquilibrium:
     """Return the system in which all displacements are variables and equilibrium of the others than the loaded ones is a constraint.
 
-    All its matrices have the pattern of the stiffness. A tenth of the time of the response to every loaded component is enough for it.
+    All its matrices have the pattern of the stiffness. It takes a fifth to a tenth of the time of the response to every loaded component.
     """
     n = o.operator.shape[1]
     others = np.setdiff1d(np.arange(n), o.loaded, assume_unique=True)
@@ -191,7 +192,7 @@ def _trace_of_prior(factor: Factorization, prior: sp.csr_matrix) -> float:
     The error, a few components, is far below the spread of chi squared.
     """
     n = prior.shape[0]
-    if n <= DENSE:
+    if n <= EXACT_TRACE:
         return float(np.sum(prior.multiply(factor.solve(np.eye(n)))))
     signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(n, PROBES))
     return float(np.sum((prior @ signs) * factor.solve(signs))) / PROBES
