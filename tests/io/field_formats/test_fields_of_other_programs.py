@@ -330,6 +330,23 @@ def test_davis_names_units_and_marks_what_is_valid(tmp_path: Path) -> None:
             read_field(path)
 
 
+def test_davis_in_voxels_is_read_with_their_size(tmp_path: Path) -> None:
+    rows = "\n".join(f"{x} {y} {z} {u} {v} {w} 1" for (x, y, z), (u, v, w) in zip(POINTS, MOVED, strict=True))
+    names = 'VARIABLES = "x[voxel]" "y[voxel]" "z[voxel]" "Vx[voxel]" "Vy[voxel]" "Vz[voxel]" "isValid"'
+    path = tmp_path / "B00001.dat"
+    path.write_text(f"{names}\nZONE I=3, J=1, K=1\n{rows}\n")
+    field = read_field(path, spacing_mm=(0.5, 0.5, 2.0))
+    np.testing.assert_allclose(field.points, POINTS * [0.5, 0.5, 2.0])
+    np.testing.assert_allclose(field.vectors, MOVED * [0.5, 0.5, 2.0])
+    with pytest.raises(InputError, match="is in voxels; give spacing_mm, the size of a voxel along x, y, z"):
+        read_field(path)
+    with pytest.raises(InputError, match=r"in voxels, but unit = 'mm'; give spacing_mm"):
+        read_field(path, unit="mm")
+    path.write_text(f"{names.replace('Vz[voxel]', 'Vz[mm]')}\nZONE I=3, J=1, K=1\n{rows}\n")
+    with pytest.raises(InputError, match=r"some variables are in voxels, and 'Vz\[mm\]' not"):
+        read_field(path, spacing_mm=(0.5, 0.5, 2.0))
+
+
 def test_points_of_a_mesh_and_their_displacement(tmp_path: Path) -> None:
     path = tmp_path / "solution.vtu"
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from naibu.io.tables.point_tables import PointTable, assembled, columns_of, read
 from naibu.io.tables.table_cells import unit_factor
 
 FARTHEST_MM = 1e5  # of a point from the origin, as in tables of markers
+_VOXEL = re.compile(r"\s*[\[(]\s*(?:voxels?|vox|vx|pixels?|px)\s*[\])]$", re.IGNORECASE)  # after the name of a column
 NEEDED = "x_mm, y_mm, z_mm, ux_mm, uy_mm, uz_mm"
 
 
@@ -43,7 +46,8 @@ def read(source: Path, *, unit: str | None = None, spacing_mm: Sequence[float] |
         raise InputError(f"{source.name}: has no columns of displacements; it needs {NEEDED}, or names like them{folder}")
     d = table.points.shape[1]
     if table.in_voxels and spacing_mm is None:
-        raise InputError(f"{source.name}: is a table of SPAM, in voxels; give spacing_mm, the size of a voxel along x, y, z")
+        whose = "" if source.suffix.lower() == ".dat" else "a table of SPAM, "
+        raise InputError(f"{source.name}: is {whose}in voxels; give spacing_mm, the size of a voxel along x, y, z")
     scale = np.ones(d) if spacing_mm is None else np.asarray(spacing_mm, dtype=float)[:d]
     known = np.asarray(np.isfinite(table.points).all(axis=1))
     if not known.any():
@@ -52,7 +56,7 @@ def read(source: Path, *, unit: str | None = None, spacing_mm: Sequence[float] |
     if (far := float(np.abs(points).max())) > FARTHEST_MM:
         raise InputError(f"{source.name}: a point lies {far:.3g} mm from the origin, {FARTHEST_MM:g} mm are possible; check the unit")
     valid = np.asarray(np.isfinite(vectors).all(axis=1) & (True if table.valid is None else table.valid[known]))
-    if table.in_voxels and table.valid is not None:
+    if table.in_voxels and table.valid is not None and source.suffix.lower() != ".dat":
         require_converged(source, valid)
     return DisplacementField.from_arrays(points, vectors, sd_mm=_sd(source, table, known, scale, valid), valid=valid)
 
@@ -69,12 +73,21 @@ def _sd(source: Path, table: PointTable, known: BoolArray, scale: FloatArray, va
 
 
 def _tecplot(source: Path, unit: str | None) -> PointTable:
-    names, values = tecplot.read_columns(source)
+    """Return the points of a Tecplot text, whose names may say that lengths are in voxels; coordinate 0 is then the middle of voxel 0."""
+    as_named, values = tecplot.read_columns(source)
+    names = [_VOXEL.sub("", name) for name in as_named]
     where = columns_of(names, source.name)
     if len(where["points"]) not in (2, 3):
-        raise InputError(f"{source.name}: cannot recognise x, y and z among its variables {', '.join(names)[:200]}")
+        raise InputError(f"{source.name}: cannot recognise x, y and z among its variables {', '.join(as_named)[:200]}")
+    lengths = {as_named[at]: names[at] != as_named[at] for some in where.values() for at in some}
+    if any(lengths.values()) and not all(lengths.values()):
+        other = ", ".join(repr(name) for name, in_voxels in lengths.items() if not in_voxels)
+        raise InputError(f"{source.name}: some variables are in voxels, and {other} not; export all lengths in one unit")
+    if any(lengths.values()) and unit is not None:
+        raise InputError(f"{source.name}: its variables are in voxels, but unit = {unit!r}; give spacing_mm, the size of a voxel, instead")
 
     def column(at: int, unit: str | None) -> FloatArray:
         return np.asarray(values[:, at] * unit_factor(source, names[at], unit))
 
-    return assembled(source, names, where, column, unit)
+    table = assembled(source, names, where, column, unit)
+    return replace(table, in_voxels=table.in_voxels or any(lengths.values()))

@@ -26,16 +26,15 @@ from naibu.identification.from_fields.forward.forward_model import Observed, Sol
 from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones, is_surface_sought
 from naibu.identification.from_fields.forward.loaded_components import (
     AN_ITERATION,
-    AT_ONCE,
-    BLOCK,
     BOUNDARY_TOLERANCE,
     REFRESHED,
-    WORTH,
+    ROUGH_TOLERANCE,
     BoundaryPreconditioner,
     KeptPreconditioners,
     Solved,
     alike,
     conjugate_gradients,
+    in_blocks,
     local_preconditioner,
 )
 from naibu.identification.from_fields.forward.refinement import Refinement
@@ -106,7 +105,7 @@ class FieldModel:
         self.law: FieldLaw = field_law(self.computed, law, averaged=self.averaged)
         self.observed = tuple(Observed.of(mesh, self.computed, load_case) for load_case in load_cases)
         self.solvers = Solvers(self.law, self.computed.points)
-        self.boundary = KeptPreconditioners.none(len(self.observed))
+        self.boundary = KeptPreconditioners.none(self.observed)
 
     @property
     def points(self) -> FloatArray:
@@ -146,7 +145,7 @@ class FieldModel:
         out.__dict__.update(self.__dict__)
         out.law = law
         out.solvers = Solvers(out.law, self.points)
-        out.boundary = KeptPreconditioners.none(len(self.observed))
+        out.boundary = KeptPreconditioners.none(self.observed)
         return out
 
     @property
@@ -268,7 +267,7 @@ class Linearised:
         for members in groups.values():
             factor = self.point.factors[members[0]]
             widths = np.cumsum([0] + [right[t].shape[1] for t in members])
-            x = _in_blocks(factor, np.concatenate([right[t] for t in members], axis=1))
+            x = in_blocks(factor, np.concatenate([right[t] for t in members], axis=1))
             for t, a, b in zip(members, widths[:-1], widths[1:], strict=True):
                 out[t] = x[:, a:b]
         return out
@@ -332,7 +331,7 @@ class Linearised:
             groups.setdefault(id(one.factor), []).append(t)
         out: list[FloatArray] = [np.empty(0)] * len(loaded)
         for members in groups.values():
-            solved = made[members[0]].unscaled(np.concatenate([loaded[t] for t in members], axis=1))
+            solved = made[members[0]].factor.solve(np.concatenate([loaded[t] for t in members], axis=1))
             for t, x in zip(members, np.split(solved, np.cumsum([loaded[t].shape[1] for t in members])[:-1], axis=1), strict=True):
                 out[t] = x / made[t].scale
         return out
@@ -365,11 +364,10 @@ class Linearised:
         except ConvergenceError:  # measurements far from the surface
             return self.loaded_solved(right)
 
-    def renew_if_due(self, columns: int) -> None:
+    def renew_if_due(self, columns: int, tolerance: float = ROUGH_TOLERANCE) -> None:
         """Have preconditioners made at this point before systems of so many columns, where others have cost or would cost more."""
-        kept, most = self.model.boundary, sum(len(o.unknown) for o in self.model.observed)
-        if not self._fresh and (columns * AT_ONCE > most or kept.spent > WORTH * most):
-            kept.forget()
+        if not self._fresh and self.model.boundary.is_due(columns, tolerance):
+            self.model.boundary.forget()
 
     def _tell(self) -> None:
         self._products += 1
@@ -383,12 +381,19 @@ class Linearised:
         return [a + o.prior @ b for a, o, b in zip(self.adjoint(pulled)[1], self.model.observed, loaded, strict=True)]
 
     def _loaded_solved(self, right: Sequence[FloatArray], tolerance: float, near: Sequence[FloatArray] | None = None) -> Solved:
-        self.renew_if_due(sum(b.shape[1] for b in right))
+        self.renew_if_due(sum(b.shape[1] for b in right), tolerance)
+        begin, kept = near, self.model.boundary
+        anew = np.inf if self._fresh or None in kept.made else kept.anew
         try:
-            return conjugate_gradients(self._loaded_product, self.preconditioned, list(right), tolerance, near)
+            solved = conjugate_gradients(self._loaded_product, self.preconditioned, list(right), tolerance, near, anew)
+            if solved.complete:
+                kept.pace = 0.0 if self._fresh else solved.pace
+                return solved
+            begin = solved.solution
         except ConvergenceError:  # the preconditioner is that of other moduli, too far from these
-            self.model.boundary.forget()
-            return conjugate_gradients(self._loaded_product, self.preconditioned, list(right), tolerance)
+            begin = None
+        kept.forget()
+        return conjugate_gradients(self._loaded_product, self.preconditioned, list(right), tolerance, begin)
 
     def concentrated(
         self, basis: FloatArray, tolerance: float = BOUNDARY_TOLERANCE, near: Sequence[FloatArray] | None = None
@@ -442,9 +447,3 @@ class Concentrated:
     def loaded(self, step: FloatArray) -> list[FloatArray]:
         """Return the change of the loaded components (n_b,) of every load case, mm, that goes with a step (k,)."""
         return [-(x @ step) - r for x, r in zip(self.response, self.offset, strict=True)]
-
-
-def _in_blocks(factor: Factorization, right: FloatArray) -> FloatArray:
-    if right.shape[1] <= BLOCK:
-        return factor.solve(right)
-    return np.concatenate([factor.solve(right[:, a : a + BLOCK]) for a in range(0, right.shape[1], BLOCK)], axis=1)
