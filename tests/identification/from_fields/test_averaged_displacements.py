@@ -8,11 +8,11 @@ from scipy.ndimage import gaussian_filter
 
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.identification.from_fields.assumptions.averaged_displacements import AVERAGES, kernel
+from naibu.identification.from_fields.assumptions.averaged_displacements import AVERAGES, Averaging, judged_averages, kernel
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
-from naibu.identification.verdict import Explanation
+from naibu.identification.verdict import Explanation, Verdict
 from naibu.validation.specimens.quadratic_body import SIDE_MM, QuadraticBody
 
 HARD, COUNT = 50.0, 12
@@ -60,3 +60,13 @@ def test_the_kernel_of_averages_is_found_from_what_neighbours_share(steps: float
     assert kernel(points, averaged(noise, steps)).length_mm == pytest.approx(steps * SIDE_MM / COUNT, rel=0.15)
     assert kernel(points, noise).length_mm == 0.0
     assert kernel(points, noise + 2.0 * averaged(noise[::-1], steps)).length_mm == 0.0  # a small part of it is shared
+
+
+def test_averages_are_told_last_where_residuals_are_more_than_noise() -> None:
+    mesh = QuadraticBody("cube").model(2, "hexahedron")[0]
+    zones, found = Zones.of(mesh, known={"known": (10.0, 0.4)}), Averaging(2.0, np.array([0.3, 0.0]))
+    for factor, place in ((0.5, 0), (3.0, 1)):
+        plain = Verdict(Explanation.IN_PART, ("another reason",), "lead", factor, 0.0, 0.5)
+        told = judged_averages(plain, found, zones, np.log([5.0, 8.0]))
+        assert told.reasons[place].startswith(AVERAGES) and "that of unknown 35 % higher" in told.reasons[place]
+    assert judged_averages(plain, None, zones, np.log([5.0, 8.0])) is plain

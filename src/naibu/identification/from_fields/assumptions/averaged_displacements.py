@@ -23,6 +23,7 @@ from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, young_and_poisson
+from naibu.identification.from_fields.verdict import WITHIN_NOISE
 from naibu.identification.neighbours import neighbours
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.point_location import locate, operator_of
@@ -115,7 +116,7 @@ def kernel(points: FloatArray, residual: FloatArray) -> Kernel:
 
 
 def judged_averages(judged: Verdict, found: Averaging | None, zones: Zones, theta: FloatArray) -> Verdict:
-    """Return the verdict with what averages would change, where that is much."""
+    """Return the verdict with what averages would change, where that is much; last where residuals are more than noise."""
     if found is None:
         return judged
     changes = told_changes(zones, np.log(young_and_poisson(theta + found.theta)[0] / young_and_poisson(theta)[0]))
@@ -126,7 +127,8 @@ def judged_averages(judged: Verdict, found: Averaging | None, zones: Zones, thet
         f"{AVERAGES} (smoothed, interpolated, or from large windows; a standard deviation of some {found.length_mm:.2g} mm): "
         f"if they are, Young's modulus would be another one: {changes}"
     )
-    return replace(judged, explanation=part, reasons=(why, *judged.reasons))
+    first = judged.noise_factor <= WITHIN_NOISE
+    return replace(judged, explanation=part, reasons=(why, *judged.reasons) if first else (*judged.reasons, why))
 
 
 def doubt_of_averages(found: Averaging | None, size: int) -> FloatArray:
