@@ -132,6 +132,17 @@ def test_what_speaks_against_the_law_may_be_elements_where_their_error_is_not_kn
         assert told.startswith(DOES_NOT_FIT) and ("elements are too large" in told) is not known and "that of b 35 % higher" in told
 
 
+def test_the_least_probability_of_three_laws_is_corrected_for_three_tries() -> None:
+    theta, plain = np.log([100.0, 8.0]), Uncertainty(np.eye(2), np.diag([0.01, 0.01]))
+    mesh = box((10.0, 10.0, 20.0), (1, 1, 2), layers=[("a", 10.0), ("b", 10.0)], centred=False)
+    zones, none = Zones.of(mesh, known={"a": (10.0, 0.45)}), np.zeros((2, 4))
+    for least, blamed in ((5e-4, False), (3e-4, True)):
+        of_laws = {"mooney_rivlin": 0.3, "yeoh": least, "neo_hookean_isochoric": 0.6}
+        free = FreeLaw(("a", "b"), np.array([0.3, 0.0]), np.zeros((2, 2)), none, none, of_laws, settled=True)
+        found = judged(EXPLAINED, free, zones, theta, plain, elements_known=True)[0]
+        assert any(reason.startswith(DOES_NOT_FIT) for reason in found.reasons) is blamed
+
+
 def test_multiples_of_a_cell_change_as_those_of_the_largest_zone() -> None:
     """That the modulus which is 1 by definition would be another one was told of maps."""
     mesh = box((10.0, 10.0, 40.0), (1, 1, 4), centred=False)

@@ -10,6 +10,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumed_law
+from naibu.identification.from_fields.assumptions.averaged_displacements import averaging, doubt_of_averages, judged_averages
 from naibu.identification.from_fields.assumptions.known_ratios import asked_ratios, doubt_of_ratios, judged_ratios
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
 from naibu.identification.from_fields.assumptions.other_readings import covariance_of_readings, judged_readings, other_readings
@@ -89,6 +90,7 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     variance = found.shared * max(1.0, found.misfit / fit.freedom)
     ratios = asked_ratios(found.at, found.quadratic, finer, variance, found.stretch)
     judged, thin = _judged(fit, found, settings)
+    averages = averaging(found.at, found.quadratic, finer, found.size.residuals, found.stretch)
     of_elements, coarse = _of_elements(fit, found, settings, judged, thin)
     total = found.of_noise.with_added(of_known + doubt_of_ratios(ratios, len(of_known))).with_law(law)
     total = total if of_elements is None else total.with_added(of_elements)
@@ -102,8 +104,8 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total, elements_known=known)
     readings = other_readings(model, fit.point, 0.0 if free is None else free.fall, variance, settings.bounds)
     judged = judged_readings(judged, readings, model.zones, theta)
-    judged = judged_ratios(judged, ratios, model.zones, theta)
-    total = total.with_added(covariance_of_readings(readings, len(theta)))
+    judged = judged_averages(judged_ratios(judged, ratios, model.zones, theta), averages, model.zones, theta)
+    total = total.with_added(covariance_of_readings(readings, len(theta)) + doubt_of_averages(averages, len(theta)))
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))
     budget = ErrorBudget(found.of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), found.shared)

@@ -93,7 +93,8 @@ def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray, *, elements_
     """Say that fields ask for another law under which a modulus would be another one by much; empty if they do not."""
     if free is None or not free.found or not free.probabilities:
         return ""
-    law, probability = min(free.probabilities.items(), key=lambda one: one[1])
+    law, least = min(free.probabilities.items(), key=lambda one: one[1])
+    probability = least * len(free.probabilities)  # of the least of so many by chance, at most
     change = np.log(young_and_poisson(theta + free.shift)[0] / young_and_poisson(theta)[0])
     changes = told_changes(zones, change)
     if probability > UNLIKELY or not changes:

@@ -3,7 +3,7 @@
 How a known region deforms depends on its Poisson's ratio, and with a wrong one its neighbours come out too stiff or too soft with small
 standard errors. Its Young's modulus sets the scale, and no field tells it; its Poisson's ratio shows in the field. To first order in
 mu / kappa of the region, moduli and the motion of the loaded nodes following, the ratio that fits best is found, and by how much it fits
-better (a score test, :cite:t:`rao1948`). Errors of elements resemble another ratio; how large they are is sought as well.
+better (`naibu.identification.from_fields.assumptions.score_test`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from naibu.core.errors import ConvergenceError
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.from_fields.assumptions.assumed_law import MODULUS, UNLIKELY
 from naibu.identification.from_fields.assumptions.other_assumptions import changes_under, other_poisson_ratio
+from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
-from naibu.identification.from_fields.mesh_error import Refit, refitted
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
@@ -70,30 +70,22 @@ def asked_ratios(
         By how much changes of logarithms are larger at vanishing element size.
     """
     model, out = at.model, []
-    given = refitted(at, quadratic, [np.zeros(len(o.data)) for o in model.observed])
-    left = _left(at, given)
-    errors, most = np.zeros_like(left), np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
-    if finer is not None:
-        pairs = zip(model.observed, at.point.states, finer, strict=True)
-        errors = _left(at, refitted(at, quadratic, [r - o.residual(u) for o, u, r in pairs])) - left
+    test, most = ScoreTest.of(at, quadratic, finer), np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
     for number, region in enumerate(model.zones.known):
         lame, shear = moduli_of(model.zones, at.point.theta)
         cells, near = model.zones.region_of_cell == number, other_poisson_ratio(region.poisson_ratio)
         lame[cells], shear[cells] = lame_parameters(region.young_modulus, near)
         try:
-            changed = refitted(at, quadratic, changes_under(at, model.law, lame, shear))
+            found = test.along(changes_under(at, model.law, lame, shear))
         except ConvergenceError:  # a body so far from equilibrium with another ratio is none that a first order could judge
             continue
-        slope = _beside(_left(at, changed) - left, errors)
-        size = _product(slope, slope)
-        if not size > 0.0:
+        if found is None:
             continue
-        score = -_product(left, slope)
         stated, other = (_compressibility(nu) for nu in (region.poisson_ratio, near))
-        part = (max(stated + score / size * (other - stated), _compressibility(MAX_POISSON_RATIO)) - stated) / (other - stated)
+        part = (max(stated + found.part * (other - stated), _compressibility(MAX_POISSON_RATIO)) - stated) / (other - stated)
         asked = _poisson_ratio(stated + part * (other - stated))
-        theta = np.clip(part * stretch * (changed.theta - given.theta), -most, most)
-        one = AskedRatio(region.name, region.poisson_ratio, asked, float(chdtrc(1, score**2 / size / variance)), theta)
+        theta = np.clip(part * stretch * found.theta, -most, most)
+        one = AskedRatio(region.name, region.poisson_ratio, asked, float(chdtrc(1, found.part**2 * found.size / variance)), theta)
         matters = np.abs(_change(one, at.point.theta)).max(initial=0.0) > MODULUS
         if one.probability < UNLIKELY and matters and abs(asked - one.stated) > STATED_SD * region.poisson_ratio_sd:
             out.append(one)
@@ -125,23 +117,6 @@ def doubt_of_ratios(found: Sequence[AskedRatio], size: int) -> FloatArray:
 def _change(one: AskedRatio, theta: FloatArray) -> FloatArray:
     """Return the change of ln E (count,) of the zones."""
     return np.asarray(np.log(young_and_poisson(theta + one.theta)[0] / young_and_poisson(theta)[0]))
-
-
-def _left(at: Linearised, refit: Refit) -> FloatArray:
-    """Return what a refit leaves (2, n): whitened residuals and the motion of the loaded nodes, that in the second row times its prior."""
-    motions = [o.sought(u + moved) for o, u, moved in zip(at.model.observed, at.point.states, refit.moved, strict=True)]
-    dual = [o.prior @ b for o, b in zip(at.model.observed, motions, strict=True)]
-    return np.stack([np.concatenate([*refit.residuals, *motions]), np.concatenate([*refit.residuals, *dual])])
-
-
-def _product(one: FloatArray, other: FloatArray) -> float:
-    return float(one[0] @ other[1])
-
-
-def _beside(rows: FloatArray, errors: FloatArray) -> FloatArray:
-    """Return rows (2, n) without what resembles errors of elements."""
-    size = _product(errors, errors)
-    return np.asarray(rows - _product(errors, rows) / size * errors) if size > 0.0 else rows
 
 
 def _compressibility(poisson: float) -> float:

@@ -1,0 +1,89 @@
+"""Score tests of another assumption against the best fit, errors of elements beside it (:cite:t:`rao1948`).
+
+Another assumption changes the model's displacement in some direction; moduli and the motion of the loaded nodes follow. How far the
+field asks to go in that direction, and with what standard error, is found to first order. Errors of elements may resemble it; how large
+they are is sought as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import BoolArray, FloatArray
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised
+from naibu.identification.from_fields.mesh_error import Refit, refitted
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Asked:
+    """What a field says of a direction.
+
+    Attributes
+    ----------
+    part : float
+        How far it asks to go, 1 for the change that was given.
+    size : float
+        Inverse variance of `part` for whitened residuals of unit variance, independent of each other.
+    theta : ndarray, shape (2 count,)
+        By how much ln mu and ln(kappa / mu) of the zones change with the whole of it.
+    """
+
+    part: float
+    size: float
+    theta: FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScoreTest:
+    """The best fit, with what it leaves (2, n) and what of that elements change; see `_left`."""
+
+    at: Linearised
+    quadratic: Concentrated
+    theta: FloatArray
+    left: FloatArray
+    errors: FloatArray
+
+    @classmethod
+    def of(cls, at: Linearised, quadratic: Concentrated, finer: Sequence[FloatArray] | None) -> ScoreTest:
+        """Begin at the best fit; `finer` are whitened residuals (q,) on elements of half the size, None where there are none."""
+        given = refitted(at, quadratic, [np.zeros(len(o.data)) for o in at.model.observed])
+        left = _left(at, given)
+        errors = np.zeros_like(left)
+        if finer is not None:
+            pairs = zip(at.model.observed, at.point.states, finer, strict=True)
+            errors = _left(at, refitted(at, quadratic, [r - o.residual(u) for o, u, r in pairs])) - left
+        return cls(at, quadratic, given.theta, left, errors)
+
+    def along(self, changes: list[FloatArray], counted: Sequence[BoolArray] | None = None) -> Asked | None:
+        """Return what the field says of changes (q,) of the whitened residuals; None where moduli and motion make up for all of them.
+
+        Where only some of the residuals (q,) are `counted`, the motion of the loaded nodes is not.
+        """
+        changed = refitted(self.at, self.quadratic, changes)
+        left, errors, slope = self.left, self.errors, _left(self.at, changed) - self.left
+        if counted is not None:
+            rows = np.flatnonzero(np.concatenate(counted))
+            left, errors, slope = left[:, rows], errors[:, rows], slope[:, rows]
+        slope = _beside(slope, errors)
+        size = _product(slope, slope)
+        return Asked(-_product(left, slope) / size, size, changed.theta - self.theta) if size > 0.0 else None
+
+
+def _left(at: Linearised, refit: Refit) -> FloatArray:
+    """Return what a refit leaves (2, n): whitened residuals and the motion of the loaded nodes, that in the second row times its prior."""
+    motions = [o.sought(u + moved) for o, u, moved in zip(at.model.observed, at.point.states, refit.moved, strict=True)]
+    dual = [o.prior @ b for o, b in zip(at.model.observed, motions, strict=True)]
+    return np.stack([np.concatenate([*refit.residuals, *motions]), np.concatenate([*refit.residuals, *dual])])
+
+
+def _product(one: FloatArray, other: FloatArray) -> float:
+    return float(one[0] @ other[1])
+
+
+def _beside(rows: FloatArray, errors: FloatArray) -> FloatArray:
+    """Return rows (2, n) without what resembles errors of elements."""
+    size = _product(errors, errors)
+    return np.asarray(rows - _product(errors, rows) / size * errors) if size > 0.0 else rows
