@@ -95,10 +95,6 @@ class LipsBesideTangent:
         np.subtract.at(force, first, change)
         np.add.at(force, second, change)
 
-    def touching(self) -> LipsBesideTangent:
-        """Return the pairs whose stiffness may differ: all of them."""
-        return self
-
     def add_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
         """Add the difference of the stiffness at the last evaluation; `positions` (p, 2, 2) are those of all pairs in the pattern."""
         places = positions[self.points]
