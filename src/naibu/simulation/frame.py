@@ -60,7 +60,7 @@ class Frame:
     unbalanced : float
         Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
     under_way : bool
-        Whether a step takes longer than a frame: all but the number is as before it.
+        Whether a step takes longer than a frame: all but the number is as before it, and the positions where parts of it have been taken.
     held : bool
         Whether crushed cells held the tool back; see `naibu.simulation.held_tool`.
     """

@@ -75,6 +75,29 @@ def test_parts_are_the_steps_of_a_session_with_shorter_ones(
     assert session.divided_steps == steps and session.newton_steps == 0
 
 
+def test_a_step_under_way_shows_the_parts_that_have_been_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are states of a session with as short steps, one after the other; before the first and behind the last there is none."""
+    made = engine(RealTimeEngine, background=False)
+    without_long_steps(monkeypatch, 0.5 * made.step)
+    sphere = spherical_indenter((1.0, 2.0, SIZE + 8.01), 8.0)
+    both = [e.session(constrained=held(made.points), indenters=[sphere]) for e in (made, replace(made, step=made.step / PARTS[0]))]
+    with both[0] as session, both[1] as shorts:
+        assert isinstance(session, RealTimeSession) and session.positions_midway is None
+        shown = []
+        while session.step_within(0.0, motions=DOWN) is None:
+            if (midway := session.positions_midway) is not None and not (shown and np.array_equal(midway, shown[-1])):
+                shown.append(midway)
+        assert session.positions_midway is None and len(shown) > 1  # parts in which nothing touches need no frame
+        ends = []
+        for _ in range(PARTS[0]):
+            shorts.step(motions=DOWN)
+            ends.append(shorts.positions())
+    moved = np.abs(ends[-1] - made.points).max()
+    apart = np.array([[np.abs(midway - end).max() for end in ends] for midway in shown]) / moved
+    assert (apart.min(axis=1) < 0.005).all() and (np.diff(apart.argmin(axis=1)) > 0).all()
+    assert apart.argmin(axis=1)[-1] == PARTS[0] - 2
+
+
 def test_parts_that_are_taken_in_many_calls_are_the_same_and_can_be_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     made = engine(RealTimeEngine, background=False)
     without_long_steps(monkeypatch, 0.5 * made.step)
