@@ -45,6 +45,7 @@ HOPE = 3  # iterations, behind which others are given up where the error is stil
 STALLED = 0.02  # of the contact forces: what iterations that reduce the error no longer may leave where sides of cuts rub
 FEW = 200  # nodes of contact at most with which they cost less than a tangent of the step's own
 UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is tried
+UNFORESEEN = 96  # nodes whose columns of the inverse are not made for an error above UNLIKELY: they take longer than parts of the step
 SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
 PATIENCE = 2.0  # times of a tangent, after which iterations are given up: parts take one, and iterations of their own
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
@@ -265,6 +266,8 @@ class RealTimeSession(DividedSession):
             after = yield from self._improved(tangent, trial, inertial, mixing)
             if after is None or after.error > DIVERGED:
                 break
+            if self._condensed is not None and not self._condensed.balanced and after.error > trial.error:
+                return after.better(best if k else None)  # no share of a step is of use whose contact finds no balance
             if after.error > JUMP * trial.error:
                 mixing = AndersonMixing(DEPTH)
             before, trial = trial.error, after
@@ -274,12 +277,14 @@ class RealTimeSession(DividedSession):
     def _improved(
         self, tangent: EarlierTangent, trial: Trial, inertial: FloatArray, mixing: AndersonMixing
     ) -> Generator[None, None, Trial | None]:
-        """Return the end of one quasi-Newton iteration; None where it inverts an element."""
+        """Return the end of one quasi-Newton iteration; None where it inverts an element, or takes too long."""
         elements = self._engine._elements
         self.iterations += 1
         force = trial.balance.copy()
         elements.add_pressures(tangent.dilatation, trial.mismatch, force)
         step = yield from self._with_contact(tangent, trial, force, not mixing.steps)
+        if step is None:
+            return None
         if not np.isfinite(step).all():  # a tangent that has no factors in single precision
             if tangent is self._own:
                 self._own = None
@@ -323,8 +328,10 @@ class RealTimeSession(DividedSession):
         felt = wrong / (exerted + engine.faint_mn) if touching else 0.0
         return Trial(u, pressure, balance, contact, mismatch, error, felt)
 
-    def _with_contact(self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool) -> Generator[None, None, FloatArray]:
-        """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are."""
+    def _with_contact(
+        self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool
+    ) -> Generator[None, None, FloatArray | None]:
+        """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are, or None."""
         sides = self._approaching(tangent, trial.displacement)
         if sides is not None:  # without what presses now, so that the sides slide by about as much as in the end
             balance += sides.now(len(balance)).reshape(-1, 3)
@@ -345,10 +352,9 @@ class RealTimeSession(DividedSession):
         marked[gripped] = marked[tangent.held] = False
         nodes = np.flatnonzero(marked).astype(np.int64)
         if len(nodes) or len(gripped) or sides is not None:
-            condensed = self._condensed
-            if condensed is None or not condensed.serves(tangent, nodes, gripped):
-                yield from tangent.factors.prepared(np.concatenate([nodes, gripped]))
-                condensed = self._condensed = CondensedContact(tangent, nodes, self._stiffness_at(nodes, tangent), gripped)
+            condensed = yield from self._condensed_to(tangent, nodes, gripped, trial)
+            if condensed is None:
+                return None
             nodes = condensed.nodes
             places = [*self._places, *([self._engine._pairs] if lips else [])]
             law = ContactBesideTangent(nodes, trial.displacement, [*active, *lips], places, self._engine._surface, tangent, sides)
@@ -373,6 +379,27 @@ class RealTimeSession(DividedSession):
                 x += tangent.factors.solve(sides.on_nodes(force[behind:], apart, tangent.held, len(free)))
         free[self._constrained] = 0.0
         return free
+
+    def _condensed_to(
+        self, tangent: EarlierTangent, nodes: IntArray, gripped: IntArray, trial: Trial
+    ) -> Generator[None, None, CondensedContact | None]:
+        """Return the contact condensed to nodes (k,), beside gripped ones (g,); None where the columns of the inverse take too long.
+
+        A trial that is thrown far off touches hundreds of nodes that a tangent was not prepared for, and leads nowhere.
+        """
+        condensed = self._condensed
+        if condensed is not None and condensed.serves(tangent, nodes, gripped):
+            return condensed
+        both = np.concatenate([nodes, gripped])
+        many = np.count_nonzero(~tangent.factors.covered(both)) > UNFORESEEN
+        if many and trial.error > UNLIKELY and self._duration == self.engine.step:
+            return None
+        for _ in tangent.factors.prepared(both):
+            if time.thread_time() > self._patience:
+                return None
+            yield
+        self._condensed = CondensedContact(tangent, nodes, self._stiffness_at(nodes, tangent), gripped)
+        return self._condensed
 
     def _approaching(self, tangent: EarlierTangent, displacement: FloatArray) -> ApproachingLips | None:
         """Return the pairs of the sides of cuts whose approach a tangent knows, at a displacement (n, 3), mm."""
