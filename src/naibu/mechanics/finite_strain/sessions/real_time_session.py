@@ -266,7 +266,7 @@ class RealTimeSession(DividedSession):
             after = yield from self._improved(tangent, trial, inertial, mixing)
             if after is None or after.error > DIVERGED:
                 break
-            if self._condensed is not None and not self._condensed.balanced and after.error > trial.error:
+            if self._condensed is not None and not self._condensed.balanced and after.error >= trial.error:
                 return after.better(best if k else None)  # no share of a step is of use whose contact finds no balance
             if after.error > JUMP * trial.error:
                 mixing = AndersonMixing(DEPTH)
