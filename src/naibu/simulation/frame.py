@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from naibu.core.arrays import FloatArray, IntArray
@@ -82,6 +82,11 @@ class Frame:
     unbalanced: float = 0.0
     under_way: bool = False
     held: bool = False
+
+    def of_a_step_under_way(self, midway: FloatArray | None) -> Frame:
+        """Return the next frame, whose step takes longer, with nodes midway (n, 3), mm, where parts of it have been taken."""
+        positions = self.positions if midway is None else midway
+        return replace(self, number=self.number + 1, positions=positions, failed="", under_way=True)
 
     @property
     def penetration_mm(self) -> float:

@@ -315,7 +315,7 @@ class InteractiveSimulation:
 
         Where the next one fails too, the body is stopped where it was, and the frame says so. Where that does not help, the body begins
         anew from its shape at rest, with its cuts and the tool where it waits, and the frame says so: nothing else would move again.
-        A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was, and is shown behind its parts.
+        A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was, and shows its parts.
         """
         self._leave()
         before = None if self.body.unmoved_by_failures else self._session.state()
@@ -344,8 +344,7 @@ class InteractiveSimulation:
         if forces is None:
             self._under_way = (centre, spin, gripped)
             midway = self._session.positions_midway if isinstance(self._session, DividedSession) else None
-            shown = self._last.positions if midway is None else midway
-            self._last = replace(self._last, number=self._last.number + 1, positions=shown, failed="", under_way=True)
+            self._last = self._last.of_a_step_under_way(midway)
             return self._last
         way, self._failures = centre - self._centre, 0
         self._centre = centre

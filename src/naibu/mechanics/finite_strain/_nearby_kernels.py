@@ -71,7 +71,7 @@ def add_stiffness(  # type: ignore[no-untyped-def]  # pragma: no cover
         slides = not tied and size > limit
         friction_derivative(e, size, n, d_trial, limit, mu[p] * slope, slides, friction)
         along = 0.0
-        if secant and slides and limit > 0.0:  # across the slip it is the secant: the trace of the derivative, as far as the surface is flat
+        if secant and slides and limit > 0.0:  # that across it, the trace of the derivative where the surface is flat
             along = max(friction[0, 0] + friction[1, 1] + friction[2, 2], 0.0) / (size * size)
         for i in range(3):
             for j in range(3):

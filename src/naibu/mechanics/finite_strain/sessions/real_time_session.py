@@ -47,6 +47,7 @@ FEW = 200  # nodes of contact at most with which they cost less than a tangent o
 UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is tried
 UNFORESEEN = 96  # nodes whose columns of the inverse are not made for an error above UNLIKELY: they take longer than parts of the step
 SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
+VAIN = 30  # beginnings, for which the body at rest is not tried again where it led nowhere
 PATIENCE = 2.0  # times of a tangent, after which iterations are given up: parts take one, and iterations of their own
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 STIFFEST = 16.0  # times the first penalty, to which penalties rise: stiffer ones need more iterations
@@ -96,6 +97,7 @@ class RealTimeSession(DividedSession):
     _pressure: FloatArray | None = field(init=False, default=None)
     _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
     _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
+    _vain: int = field(init=False, default=0)  # beginnings until the body at rest is tried again
     _patience: float = field(init=False, default=np.inf)  # processor time at which a step gives an earlier tangent up
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
@@ -191,7 +193,8 @@ class RealTimeSession(DividedSession):
         """Return the best that is found from the guesses, one after the other until a balance is accepted."""
         best = None
         for first, near, most in self._guesses(tangent, moving, inertial, pressure, still_first=still_first):
-            best = (yield from self._iterated(near, first, inertial, deadline, most)).better(best)
+            found = yield from self._iterated(near, first, inertial, deadline, most)
+            best, self._vain = found.better(best), VAIN if near is not tangent and found.error > UNLIKELY else self._vain
             if best.error <= ACCEPTED or time.thread_time() > self._patience:
                 break
         return best
@@ -205,7 +208,8 @@ class RealTimeSession(DividedSession):
         tangent is that of the body as it is, and the motion is fast, the way from there is the better one.
         """
         first = self._guessed(inertial, moving, inertial, pressure)
-        if self._duration == self.engine.step and (first is None or first.error > UNLIKELY):
+        self._vain = max(self._vain - 1, 0)
+        if self._duration == self.engine.step and self._vain == 0 and (first is None or first.error > UNLIKELY):
             for kept in self._engine._rest:
                 rest = self._at_rest(kept, moving, inertial) if np.array_equal(kept.held, tangent.held) else None
                 if rest is not None and (first is None or rest.error < first.error):
@@ -331,7 +335,7 @@ class RealTimeSession(DividedSession):
     def _with_contact(
         self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool
     ) -> Generator[None, None, FloatArray | None]:
-        """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are, or None."""
+        """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they are then, if any."""
         sides = self._approaching(tangent, trial.displacement)
         if sides is not None:  # without what presses now, so that the sides slide by about as much as in the end
             balance += sides.now(len(balance)).reshape(-1, 3)
