@@ -268,6 +268,11 @@ def in_threes(amounts: FloatArray) -> FloatArray:
     return out
 
 
+def motion_in_threes(sides: ApproachingLips | None, motion: FloatArray) -> list[FloatArray]:
+    """Return by how much pairs go apart as nodes move (n, 3), mm, in rows of three; nothing where there are no pairs."""
+    return [] if sides is None else [in_threes(sides.motion(motion))]
+
+
 def change_in_threes(change: FloatArray, first: int) -> BlockChange:
     """Return the change of stiffnesses (p,), mN/mm, as that of rows of three, of which row `first` is the first one."""
     rows = in_threes(change)

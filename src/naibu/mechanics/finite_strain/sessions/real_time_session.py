@@ -28,7 +28,7 @@ from naibu.mechanics.finite_strain.sessions.contact_beside_tangent import Contac
 from naibu.mechanics.finite_strain.sessions.divided_session import DividedSession
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, changing_lips, in_threes
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, changing_lips, in_threes, motion_in_threes
 from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel
 from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
 from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, Trial
@@ -48,7 +48,8 @@ UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is 
 UNFORESEEN = 96  # nodes whose columns of the inverse are not made for an error above UNLIKELY: they take longer than parts of the step
 SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
 VAIN = 30  # beginnings, for which the body at rest is not tried again where it led nowhere
-PATIENCE = 2.0  # times of a tangent, after which iterations are given up: parts take one, and iterations of their own
+PATIENCE, LONGEST_S = 2.0, 0.25  # times of a tangent, and s, after which iterations are given up: parts take one, and some of their own
+IN_PART_S = 0.05  # of a processor for the contact of an iteration of a part at most
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 STIFFEST = 16.0  # times the first penalty, to which penalties rise: stiffer ones need more iterations
 RUBBING = 8  # matrices for contacts in an iteration where sides of cuts rub: many pairs stick or slip by turns, and none is held back
@@ -185,7 +186,12 @@ class RealTimeSession(DividedSession):
     def _given_up(self, tangent: EarlierTangent) -> float:
         """Return the processor time at which iterations are given up for another tangent, or parts: where those would have taken less."""
         live = self._engine.background and self._duration == self.engine.step
-        return time.thread_time() + max(BUDGET_S, PATIENCE * tangent.seconds) if live else np.inf
+        return time.thread_time() + max(BUDGET_S, min(PATIENCE * tangent.seconds, LONGEST_S)) if live else np.inf
+
+    def _sought_until(self) -> float:
+        """Return the processor time until which the contact of an iteration is sought."""
+        in_part = self._engine.background and self._duration < self.engine.step
+        return time.thread_time() + IN_PART_S if in_part else self._patience
 
     def _from_guesses(
         self, tangent: EarlierTangent, moving: FloatArray, inertial: FloatArray, pressure: FloatArray, deadline: float, *, still_first: bool
@@ -370,11 +376,11 @@ class RealTimeSession(DividedSession):
             extent, faint = self.engine._extent, self._engine.faint_mn
             longest = min(0.05 * extent, float(harmless_ways(self.indenters).min(initial=np.inf)))
             limits = (RUBBING, RUBBING) if self.engine.assembler.unsymmetric else (CHANGES, UNAIDED)
-            still, begins = (np.concatenate([motion[nodes], *_of_sides(sides, motion)]) for motion in (free, begin))
+            still, begins = (np.concatenate([motion[nodes], *motion_in_threes(sides, motion)]) for motion in (free, begin))
             alone = condensed.held(still, free[gripped])
             if sides is not None:
                 sides.slide(free)
-            force = yield from condensed.forces(alone, law, begins, 1e-5 * extent, longest, faint, *limits, self._patience)
+            force = yield from condensed.forces(alone, law, begins, 1e-5 * extent, longest, faint, *limits, self._sought_until())
             holding = condensed.holding(free[gripped], force)
             behind = len(nodes)
             tangent.factors.add_columns(np.concatenate([nodes, gripped]), np.concatenate([force[:behind], holding]), x)
@@ -440,8 +446,3 @@ class RealTimeSession(DividedSession):
 
     def _exerted(self, trial: Trial) -> FloatArray:
         return np.array([(trial.balance - trial.contact)[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3)
-
-
-def _of_sides(sides: ApproachingLips | None, motion: FloatArray) -> list[FloatArray]:
-    """Return by how much pairs go apart as nodes move (n, 3), mm, in rows of three; nothing where there are no pairs."""
-    return [] if sides is None else [in_threes(sides.motion(motion))]
