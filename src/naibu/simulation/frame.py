@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from naibu.core.arrays import FloatArray, IntArray
@@ -60,7 +60,7 @@ class Frame:
     unbalanced : float
         Out-of-balance forces that the next frames take up, as a fraction of all forces, or of those of contact where that is more.
     under_way : bool
-        Whether a step takes longer than a frame: all but the number is as before it.
+        Whether a step takes longer than a frame: all but the number is as before it, and the positions where parts of it have been taken.
     held : bool
         Whether crushed cells held the tool back; see `naibu.simulation.held_tool`.
     """
@@ -82,6 +82,11 @@ class Frame:
     unbalanced: float = 0.0
     under_way: bool = False
     held: bool = False
+
+    def of_a_step_under_way(self, midway: FloatArray | None) -> Frame:
+        """Return the next frame, whose step takes longer, with nodes midway (n, 3), mm, where parts of it have been taken."""
+        positions = self.positions if midway is None else midway
+        return replace(self, number=self.number + 1, positions=positions, failed="", under_way=True)
 
     @property
     def penetration_mm(self) -> float:

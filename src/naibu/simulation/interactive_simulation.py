@@ -19,6 +19,7 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.rigid_transform import rotation_between, rotation_matrix
 from naibu.mechanics.contact.indenter_motion import IndenterVelocity
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
+from naibu.mechanics.finite_strain.sessions.divided_session import DividedSession
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.simulation.background_cut import BackgroundCut, cut_in_balance
@@ -312,9 +313,9 @@ class InteractiveSimulation:
     def advance(self) -> Frame:
         """Take the steps of one frame, and return it; a step that fails is taken back, and the frame says why.
 
-        Where the next one fails too, the body is stopped where it was, and the frame says so. Where that does not help, nothing would
-        move again: the body begins anew from its shape at rest, with its cuts and the tool where it waits, and the frame says so.
-        A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was when the step began.
+        Where the next one fails too, the body is stopped where it was, and the frame says so. Where that does not help, the body begins
+        anew from its shape at rest, with its cuts and the tool where it waits, and the frame says so: nothing else would move again.
+        A step that takes longer than the frame may goes on in the next one, with the tool's motion as it was, and shows its parts.
         """
         self._leave()
         before = None if self.body.unmoved_by_failures else self._session.state()
@@ -342,7 +343,8 @@ class InteractiveSimulation:
             return self._last
         if forces is None:
             self._under_way = (centre, spin, gripped)
-            self._last = replace(self._last, number=self._last.number + 1, failed="", under_way=True)
+            midway = self._session.positions_midway if isinstance(self._session, DividedSession) else None
+            self._last = self._last.of_a_step_under_way(midway)
             return self._last
         way, self._failures = centre - self._centre, 0
         self._centre = centre

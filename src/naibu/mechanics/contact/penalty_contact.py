@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from naibu._numba.compilation import njit
+from naibu._numba.compilation import UNCOUNTED, njit
 from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.core.rigid_transform import rotation_matrix
 from naibu.mechanics.contact._geometry_kernels import distance_with_derivatives, mesh_of, signed_distance
@@ -198,6 +198,38 @@ def normal_pressure(g, k_n, tied):  # type: ignore[no-untyped-def]  # pragma: no
     return -k_n * (g + 0.5 * RAMP_MM), -k_n
 
 
+@njit(cache=True, **UNCOUNTED)
+def trial_friction(y, anchor, n, h, k_t, e, d_trial):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return the size of the friction traction of a point that sticks; set the traction e (3,) and its derivative d_trial (3, 3)."""
+    along, size = 0.0, 0.0
+    for i in range(3):
+        along += n[i] * (y[i] - anchor[i])
+    for i in range(3):
+        e[i] = k_t * (y[i] - anchor[i] - along * n[i])
+        size += e[i] * e[i]
+    # derivative of the trial traction: k_t (P - along H - n (H (y - a))^T)
+    for j in range(3):
+        hd = 0.0
+        for m in range(3):
+            hd += h[j, m] * (y[m] - anchor[m])
+        for i in range(3):
+            d_trial[i, j] = k_t * ((1.0 if i == j else 0.0) - n[i] * n[j] - along * h[i, j] - n[i] * hd)
+    return np.sqrt(size)
+
+
+@njit(cache=True, **UNCOUNTED)
+def friction_derivative(e, size, n, d_trial, limit, rise, sliding, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Set out (3, 3) to the derivative of a friction traction that may slide at a limit, which changes by `rise` with the gap."""
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = d_trial[i, j]
+            if sliding:
+                projected = d_trial[i, j]
+                for m in range(3):
+                    projected -= e[i] * e[m] / (size * size) * d_trial[m, j]
+                out[i, j] = limit / size * projected + rise * n[j] * e[i] / size
+
+
 @njit(cache=True, nogil=True)
 def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
     geometry, axes, y, anchors, area, k_n, k_t, mu, tied, curvature,
@@ -215,39 +247,22 @@ def _tractions(  # type: ignore[no-untyped-def]  # pragma: no cover
         if dp == 0.0:
             continue
         distance_with_derivatives(geometry, axes, y[q], n, h)
-        along = 0.0
-        for i in range(3):
-            along += n[i] * (y[q, i] - anchors[q, i])
-        size = 0.0
-        for i in range(3):
-            e[i] = k_t[q] * (y[q, i] - anchors[q, i] - along * n[i])
-            size += e[i] * e[i]
-        size = np.sqrt(size)
-        # derivative of the trial traction: k_t (P - along H - n (H (y - a))^T)
-        for i in range(3):
-            for j in range(3):
-                hd = 0.0
-                for m in range(3):
-                    hd += h[j, m] * (y[q, m] - anchors[q, m])
-                d_trial[i, j] = k_t[q] * ((1.0 if i == j else 0.0) - n[i] * n[j] - along * h[i, j] - n[i] * hd)
+        size = trial_friction(y[q], anchors[q], n, h, k_t[q], e, d_trial)
         sliding = not tied and size > mu[q] * p
         ratio = mu[q] * p / size if sliding else 1.0
         for i in range(3):
             friction[q, i] = ratio * e[i]
             force[q, i] = area[q] * (p * n[i] - ratio * e[i])
+        friction_derivative(e, size, n, d_trial, mu[q] * p, mu[q] * dp, sliding, friction_stiffness[q])
         for i in range(3):
             for j in range(3):
-                dt = d_trial[i, j]
                 da = k_t[q] * ((1.0 if i == j else 0.0) - n[i] * n[j])
                 if sliding:
-                    projected, projected_a = dt, da
+                    projected_a = da
                     for m in range(3):
-                        projected -= e[i] * e[m] / (size * size) * d_trial[m, j]
                         projected_a -= e[i] * e[m] / (size * size) * k_t[q] * ((1.0 if m == j else 0.0) - n[m] * n[j])
-                    dt = ratio * projected + mu[q] * dp * n[j] * e[i] / size
                     da = ratio * projected_a
-                friction_stiffness[q, i, j] = dt
-                stiffness[q, i, j] = area[q] * (dt - dp * n[i] * n[j] - curvature * p * h[i, j])
+                stiffness[q, i, j] = area[q] * (friction_stiffness[q, i, j] - dp * n[i] * n[j] - curvature * p * h[i, j])
                 anchor_stiffness[q, i, j] = area[q] * da
             if sliding:
                 slip[q, i] = -area[q] * p * e[i] / size

@@ -11,10 +11,11 @@ from naibu.mechanics.contact._geometry_kernels import (
     PLANE,
     distance_and_normal_of_box,
     distance_from_primitive,
+    distance_with_derivatives,
     mesh_of,
     signed_distance,
 )
-from naibu.mechanics.contact.penalty_contact import normal_pressure
+from naibu.mechanics.contact.penalty_contact import friction_derivative, normal_pressure, trial_friction
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -52,6 +53,42 @@ def add_forces(  # type: ignore[no-untyped-def]  # pragma: no cover
             f = orientation[i, 0] * d[0] + orientation[i, 1] * d[1] + orientation[i, 2] * d[2]
             for a in range(shape.shape[1]):
                 force[nodes[p, a], i] += shape[p, a] * f
+
+
+@njit(cache=True, nogil=True)
+def add_stiffness(  # type: ignore[no-untyped-def]  # pragma: no cover
+    geometry, axes, nodes, shape, rest, area, k_n, k_t, mu, tied, u, centre, orientation, anchors, gap, points, positions, secant, blocks
+):
+    """Add the stiffness of the points with negative gaps to blocks, that of friction with its secant along the slip or without."""
+    d, y, q, n, e, h = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
+    d_trial, friction, own, world = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    for p in range(len(nodes)):
+        if gap[p] >= 0.0:
+            continue
+        _place(p, nodes, shape, rest, u, centre, orientation, axes, d, y, q)
+        pressure, slope = normal_pressure(distance_with_derivatives(geometry, axes, y, n, h), k_n[p], tied)
+        size, limit = trial_friction(y, anchors[p], n, h, k_t[p], e, d_trial), mu[p] * pressure
+        slides = not tied and size > limit
+        friction_derivative(e, size, n, d_trial, limit, mu[p] * slope, slides, friction)
+        along = 0.0
+        if secant and slides and limit > 0.0:  # that across it, the trace of the derivative where the surface is flat
+            along = max(friction[0, 0] + friction[1, 1] + friction[2, 2], 0.0) / (size * size)
+        for i in range(3):
+            for j in range(3):
+                own[i, j] = area[p] * (friction[i, j] - slope * n[i] * n[j] + along * e[i] * e[j])
+        for i in range(3):
+            d[0] = d[1] = d[2] = 0.0
+            for m in range(3):
+                for j in range(3):
+                    d[j] += orientation[i, m] * own[m, j]
+            for j in range(3):
+                world[i, j] = d[0] * orientation[j, 0] + d[1] * orientation[j, 1] + d[2] * orientation[j, 2]
+        for a in range(shape.shape[1]):
+            for b in range(shape.shape[1]):
+                weight, place = shape[p, a] * shape[p, b], positions[points[p], a, b]
+                for i in range(3):
+                    for j in range(3):
+                        blocks[place, i, j] += weight * world[i, j]
 
 
 @njit(cache=True, nogil=True)

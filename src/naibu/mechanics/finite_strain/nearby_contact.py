@@ -9,7 +9,7 @@ import numpy as np
 from naibu.core.arrays import BoolArray, FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact.indenter_geometry import packed_geometry
 from naibu.mechanics.contact.penalty_contact import Contact, ContactResponse
-from naibu.mechanics.finite_strain._nearby_kernels import add_forces, local
+from naibu.mechanics.finite_strain._nearby_kernels import add_forces, add_stiffness, local
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern
 
 
@@ -105,21 +105,23 @@ class NearbyContact:
         return some
 
     def add_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
-        """Add the stiffness at the last evaluation; `positions` are those of all points in the pattern."""
-        if len(self.points):
-            self.contact.add_stiffness(self.response, pattern, positions[self.points], blocks)
+        """Add the stiffness at the last evaluation, without the curvature of the body's surface, to blocks of a pattern.
+
+        `positions` are those of all points in the pattern.
+        """
+        self._add_stiffness(positions, blocks, secant=False)
 
     def add_secant_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
         """Add what `add_stiffness` adds and, where points slip, the friction over the elastic slip, along the slip."""
-        if len(self.points):
-            r = self.response
-            size = np.linalg.norm(r.tangential, axis=1)
-            along = r.tangential / np.where(size == 0.0, 1.0, size)[:, None]
-            slips = r.slip_direction.any(axis=1)
-            # across the slip the stiffness is the secant: the trace of the derivative, as far as the surface is flat
-            secant = np.where(slips, np.maximum(np.trace(r.tangential_stiffness, axis1=1, axis2=2), 0.0), 0.0)
-            more = (self.contact.area * secant)[:, None, None] * along[:, :, None] * along[:, None, :]
-            self.contact.add_stiffness(replace(r, stiffness=r.stiffness + more), pattern, positions[self.points], blocks)
+        self._add_stiffness(positions, blocks, secant=True)
+
+    def _add_stiffness(self, positions: Int32Array, blocks: FloatArray, *, secant: bool) -> None:
+        c = self.contact
+        add_stiffness(
+            packed_geometry(c.surface), c.surface.axes, c.nodes, c.shape, c.rest, c.area, c.normal_stiffness, c.tangential_stiffness,
+            c.friction_coefficient, c.tied, self._displacement, c.position(1.0), c.orientation(1.0), self.anchors, self.gap, self.points,
+            positions, secant, blocks,
+        )  # fmt: skip
 
     def add_symmetric_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
         """Add what `add_stiffness` adds but the growth of friction with pressure, without which the stiffness is symmetric."""

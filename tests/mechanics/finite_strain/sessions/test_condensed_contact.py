@@ -277,3 +277,28 @@ def test_pairs_that_open_and_close_at_once_are_those_of_the_quadratic_programme(
     expected = nnls(root, -np.linalg.solve(root.T, gap + still), maxiter=100 * count)[0]
     np.testing.assert_allclose(found.ravel(), expected, atol=2e-3 * expected.max())
     assert contact.balanced
+
+
+class LeapingSides(Sides):
+    """Pairs whose forces leap where they meet: what presses less has no balance, and is left however many matrices are made."""
+
+    changes = 0
+
+    def __call__(self, motion: FloatArray) -> FloatArray:
+        pushed = super().__call__(motion)
+        return np.asarray(pushed + 50.0 * (self.deep > 0.0))
+
+    def change(self, *, exact: bool = False) -> BlockChange:
+        self.changes += 1
+        return super().change(exact=exact)
+
+
+def test_steps_end_where_they_no_longer_change_what_is_left() -> None:
+    count, sides = 3, LeapingSides(np.full((1, 3), 0.5))
+    tangent, none = factorized(BODY * np.eye(3)), np.zeros(0, np.int64)
+    inverse, nowhere = np.eye(count, dtype=np.float32) / BODY, np.zeros((count, 0), dtype=np.float32)
+    pairs = PairedMotion(np.arange(count), np.zeros((count, 2), np.int64), np.zeros((count, 3)), inverse, nowhere)
+    contact = CondensedContact(replace(tangent, pairs=pairs), none, np.full(1, BODY))
+    found_by(contact.forces(np.full((1, 3), -2.0), sides, np.zeros((1, 3)), 1e-5, 1e9, 1e-6))
+    assert not contact.balanced
+    assert sides.changes <= 8

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from naibu.mechanics import (
     spherical_indenter,
 )
 from naibu.mechanics.contact.penalty_contact import Contact
+from naibu.mechanics.finite_strain.sessions import real_time_session
 from naibu.mechanics.finite_strain.sessions.divided_session import PARTS
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
 from naibu.mechanics.finite_strain.sessions.trial_displacement import Trial
@@ -73,6 +75,59 @@ def test_parts_are_the_steps_of_a_session_with_shorter_ones(
     assert moved > 1.0
     assert isinstance(session, RealTimeSession)
     assert session.divided_steps == steps and session.newton_steps == 0
+
+
+@pytest.mark.parametrize("why", ["unsolved", "unforeseen"])
+def test_whole_steps_that_lead_nowhere_are_soon_taken_in_parts(monkeypatch: pytest.MonkeyPatch, why: str) -> None:
+    """Where contact finds no balance and no share of a step helps, or a trial touches many nodes that a tangent is not prepared for."""
+    taken, tries = RealTimeSession._with_contact, []
+
+    def nowhere(self: RealTimeSession, *given: Any) -> Generator[None, None, FloatArray | None]:
+        step = yield from taken(self, *given)
+        if self._duration == self.engine.step and self._condensed is not None and step is not None:
+            tries.append(1)
+            self._condensed.balanced, step = False, 0.0 * step
+        return step
+
+    made, both = engine(RealTimeEngine, background=False), []
+    for hindered in (False, True):
+        with monkeypatch.context() as patched:
+            if hindered and why == "unsolved":
+                patched.setattr(RealTimeSession, "_with_contact", nowhere)
+            if hindered and why == "unforeseen":
+                patched.setattr(real_time_session, "UNFORESEEN", -1)
+                patched.setattr(real_time_session, "UNLIKELY", 0.0)
+            with made.session(constrained=held(made.points), indenters=[spherical_indenter((1.0, 2.0, SIZE + 8.2), 8.0)]) as session:
+                for _ in range(3):
+                    session.step(motions=DOWN)
+                assert isinstance(session, RealTimeSession) and session.newton_steps == 0
+                assert (session.divided_steps > 0) == hindered
+                both.append(session.positions())
+    assert len(tries) <= 4 * 3  # of each step: two beginnings, with two tangents; there were twice as many
+    np.testing.assert_allclose(both[1], both[0], atol=0.1 * np.abs(both[0] - made.points).max())  # shorter steps damp less
+
+
+def test_a_step_under_way_shows_the_parts_that_have_been_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are states of a session with as short steps, one after the other; before the first and behind the last there is none."""
+    made = engine(RealTimeEngine, background=False)
+    without_long_steps(monkeypatch, 0.5 * made.step)
+    sphere = spherical_indenter((1.0, 2.0, SIZE + 8.01), 8.0)
+    both = [e.session(constrained=held(made.points), indenters=[sphere]) for e in (made, replace(made, step=made.step / PARTS[0]))]
+    with both[0] as session, both[1] as shorts:
+        assert isinstance(session, RealTimeSession) and session.positions_midway is None
+        shown = []
+        while session.step_within(0.0, motions=DOWN) is None:
+            if (midway := session.positions_midway) is not None and not (shown and np.array_equal(midway, shown[-1])):
+                shown.append(midway)
+        assert session.positions_midway is None and len(shown) > 1  # parts in which nothing touches need no frame
+        ends = []
+        for _ in range(PARTS[0]):
+            shorts.step(motions=DOWN)
+            ends.append(shorts.positions())
+    moved = np.abs(ends[-1] - made.points).max()
+    apart = np.array([[np.abs(midway - end).max() for end in ends] for midway in shown]) / moved
+    assert (apart.min(axis=1) < 0.005).all() and (np.diff(apart.argmin(axis=1)) > 0).all()
+    assert apart.argmin(axis=1)[-1] == PARTS[0] - 2
 
 
 def test_parts_that_are_taken_in_many_calls_are_the_same_and_can_be_given_up(monkeypatch: pytest.MonkeyPatch) -> None:

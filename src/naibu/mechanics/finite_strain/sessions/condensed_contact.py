@@ -49,6 +49,7 @@ BALANCED = 0.003  # of the forces: how much those of the motion that they lead t
 DOWNHILL = 2  # times as many matrices where steps end when the forces that are left do no more work
 LEFT = 0.5  # of the work at the beginning of such a step: what may be left at its end
 SEARCHED = 8  # ends of a step that are tried
+UNMOVED, IDLE = 0.01, 3  # change of what is left in two such steps, and how many in a row change it by no more before they are given up
 ENOUGH = 0.005  # likewise, where no further matrix is worth while
 
 
@@ -281,9 +282,9 @@ class _Search:
         every step, the forces that are left do work until it is least, and there the step ends. They are left of the forces under which a
         motion is ``y = free + W f``, which a whole step determines.
         """
-        law, nodes, best, exerted = self.law, len(self.body.nodes), at, None
+        law, nodes, best, exerted, idle, sizes = self.law, len(self.body.nodes), at, None, 0, [np.inf, at.size]
         for _ in range(most):
-            if time.thread_time() > self.until:
+            if time.thread_time() > self.until or idle == IDLE:
                 break
             yield
             law(at.motion)  # its last motion may be another
@@ -302,6 +303,8 @@ class _Search:
                 exerted = exerted + share * further
             at = self._tried(at.motion + share * step)
             best = at if at.size < best.size else best
+            sizes.append(at.size)
+            idle = idle + 1 if abs(at.size - sizes[-3]) <= UNMOVED * at.size else 0
             if at.size <= 10.0 * self.tolerance_mm and self._consistent(at, ENOUGH):
                 return at, True
         return best, False

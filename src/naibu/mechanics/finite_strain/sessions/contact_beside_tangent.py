@@ -90,8 +90,7 @@ class ContactBesideTangent:
         blocks = np.zeros((self.pattern.n_blocks, 3, 3))
         numbered: list[NearbyContact | LipsBesideTangent] = [*self._indenters, *self._lips]
         for contact, places in zip(numbered, self.places, strict=True):
-            touching = contact.touching()
-            (touching.add_stiffness if exact else touching.add_secant_stiffness)(self.pattern, places, blocks)
+            (contact.add_stiffness if exact else contact.add_secant_stiffness)(self.pattern, places, blocks)
         return self._beside(blocks, self.sides.change() if self.sides else None)
 
     def opened(self) -> BlockChange:

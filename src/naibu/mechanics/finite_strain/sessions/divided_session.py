@@ -58,6 +58,12 @@ class DividedSession(NewtonSession):
         """Whether `step_within` has begun a step whose balance is not yet found."""
         return self._search is not None
 
+    @property
+    def positions_midway(self) -> FloatArray | None:
+        """Where the parts that have been taken of the step under way lead the nodes (n, 3), mm; None where none has."""
+        state = self._midway
+        return None if state is None or state is self.reached else self.engine.points + state.displacement
+
     def step_within(self, budget_s: float, velocity: ArrayLike = 0.0, motions: Sequence[IndenterMotion] = ()) -> StepForces | None:
         """Take a step, or work on it for about a time of the processor; None: call again, with the same motions, to go on with it.
 

@@ -95,10 +95,6 @@ class LipsBesideTangent:
         np.subtract.at(force, first, change)
         np.add.at(force, second, change)
 
-    def touching(self) -> LipsBesideTangent:
-        """Return the pairs whose stiffness may differ: all of them."""
-        return self
-
     def add_stiffness(self, pattern: BlockPattern, positions: Int32Array, blocks: FloatArray) -> None:
         """Add the difference of the stiffness at the last evaluation; `positions` (p, 2, 2) are those of all pairs in the pattern."""
         places = positions[self.points]
@@ -270,6 +266,11 @@ def in_threes(amounts: FloatArray) -> FloatArray:
     out = np.zeros((-(-len(amounts) // 3), 3))
     out.ravel()[: len(amounts)] = amounts
     return out
+
+
+def motion_in_threes(sides: ApproachingLips | None, motion: FloatArray) -> list[FloatArray]:
+    """Return by how much pairs go apart as nodes move (n, 3), mm, in rows of three; nothing where there are no pairs."""
+    return [] if sides is None else [in_threes(sides.motion(motion))]
 
 
 def change_in_threes(change: FloatArray, first: int) -> BlockChange:

@@ -28,7 +28,7 @@ from naibu.mechanics.finite_strain.sessions.contact_beside_tangent import Contac
 from naibu.mechanics.finite_strain.sessions.divided_session import DividedSession
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, changing_lips, in_threes
+from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, changing_lips, in_threes, motion_in_threes
 from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel
 from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
 from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, Trial
@@ -45,8 +45,11 @@ HOPE = 3  # iterations, behind which others are given up where the error is stil
 STALLED = 0.02  # of the contact forces: what iterations that reduce the error no longer may leave where sides of cuts rub
 FEW = 200  # nodes of contact at most with which they cost less than a tangent of the step's own
 UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is tried
+UNFORESEEN = 96  # nodes whose columns of the inverse are not made for an error above UNLIKELY: they take longer than parts of the step
 SPARE = 8  # nodes for which a step that took no iteration prepares the inverse, if they are about to be in contact and it is not known
-PATIENCE = 2.0  # times of a tangent, after which iterations are given up: parts take one, and iterations of their own
+VAIN = 30  # beginnings, for which the body at rest is not tried again where it led nowhere
+PATIENCE, LONGEST_S = 2.0, 0.25  # times of a tangent, and s, after which iterations are given up: parts take one, and some of their own
+IN_PART_S = 0.05  # of a processor for the contact of an iteration of a part at most
 JUMP = 10.0  # its growth from which earlier iterations are forgotten, as where contacts close
 STIFFEST = 16.0  # times the first penalty, to which penalties rise: stiffer ones need more iterations
 RUBBING = 8  # matrices for contacts in an iteration where sides of cuts rub: many pairs stick or slip by turns, and none is held back
@@ -95,6 +98,7 @@ class RealTimeSession(DividedSession):
     _pressure: FloatArray | None = field(init=False, default=None)
     _elements: PressureElements = field(init=False, repr=False)  # with the normals of the sides of cuts when the step begins
     _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
+    _vain: int = field(init=False, default=0)  # beginnings until the body at rest is tried again
     _patience: float = field(init=False, default=np.inf)  # processor time at which a step gives an earlier tangent up
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
@@ -182,7 +186,12 @@ class RealTimeSession(DividedSession):
     def _given_up(self, tangent: EarlierTangent) -> float:
         """Return the processor time at which iterations are given up for another tangent, or parts: where those would have taken less."""
         live = self._engine.background and self._duration == self.engine.step
-        return time.thread_time() + max(BUDGET_S, PATIENCE * tangent.seconds) if live else np.inf
+        return time.thread_time() + max(BUDGET_S, min(PATIENCE * tangent.seconds, LONGEST_S)) if live else np.inf
+
+    def _sought_until(self) -> float:
+        """Return the processor time until which the contact of an iteration is sought."""
+        in_part = self._engine.background and self._duration < self.engine.step
+        return time.thread_time() + IN_PART_S if in_part else self._patience
 
     def _from_guesses(
         self, tangent: EarlierTangent, moving: FloatArray, inertial: FloatArray, pressure: FloatArray, deadline: float, *, still_first: bool
@@ -190,7 +199,8 @@ class RealTimeSession(DividedSession):
         """Return the best that is found from the guesses, one after the other until a balance is accepted."""
         best = None
         for first, near, most in self._guesses(tangent, moving, inertial, pressure, still_first=still_first):
-            best = (yield from self._iterated(near, first, inertial, deadline, most)).better(best)
+            found = yield from self._iterated(near, first, inertial, deadline, most)
+            best, self._vain = found.better(best), VAIN if near is not tangent and found.error > UNLIKELY else self._vain
             if best.error <= ACCEPTED or time.thread_time() > self._patience:
                 break
         return best
@@ -204,7 +214,8 @@ class RealTimeSession(DividedSession):
         tangent is that of the body as it is, and the motion is fast, the way from there is the better one.
         """
         first = self._guessed(inertial, moving, inertial, pressure)
-        if self._duration == self.engine.step and (first is None or first.error > UNLIKELY):
+        self._vain = max(self._vain - 1, 0)
+        if self._duration == self.engine.step and self._vain == 0 and (first is None or first.error > UNLIKELY):
             for kept in self._engine._rest:
                 rest = self._at_rest(kept, moving, inertial) if np.array_equal(kept.held, tangent.held) else None
                 if rest is not None and (first is None or rest.error < first.error):
@@ -265,6 +276,8 @@ class RealTimeSession(DividedSession):
             after = yield from self._improved(tangent, trial, inertial, mixing)
             if after is None or after.error > DIVERGED:
                 break
+            if self._condensed is not None and not self._condensed.balanced and after.error >= trial.error:
+                return after.better(best if k else None)  # no share of a step is of use whose contact finds no balance
             if after.error > JUMP * trial.error:
                 mixing = AndersonMixing(DEPTH)
             before, trial = trial.error, after
@@ -274,12 +287,14 @@ class RealTimeSession(DividedSession):
     def _improved(
         self, tangent: EarlierTangent, trial: Trial, inertial: FloatArray, mixing: AndersonMixing
     ) -> Generator[None, None, Trial | None]:
-        """Return the end of one quasi-Newton iteration; None where it inverts an element."""
+        """Return the end of one quasi-Newton iteration; None where it inverts an element, or takes too long."""
         elements = self._engine._elements
         self.iterations += 1
         force = trial.balance.copy()
         elements.add_pressures(tangent.dilatation, trial.mismatch, force)
         step = yield from self._with_contact(tangent, trial, force, not mixing.steps)
+        if step is None:
+            return None
         if not np.isfinite(step).all():  # a tangent that has no factors in single precision
             if tangent is self._own:
                 self._own = None
@@ -323,8 +338,10 @@ class RealTimeSession(DividedSession):
         felt = wrong / (exerted + engine.faint_mn) if touching else 0.0
         return Trial(u, pressure, balance, contact, mismatch, error, felt)
 
-    def _with_contact(self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool) -> Generator[None, None, FloatArray]:
-        """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they then are."""
+    def _with_contact(
+        self, tangent: EarlierTangent, trial: Trial, balance: FloatArray, first: bool
+    ) -> Generator[None, None, FloatArray | None]:
+        """Return the step (n, 3), mm, that brings a balance (n, 3), mN, without contact to zero, with contacts as they are then, if any."""
         sides = self._approaching(tangent, trial.displacement)
         if sides is not None:  # without what presses now, so that the sides slide by about as much as in the end
             balance += sides.now(len(balance)).reshape(-1, 3)
@@ -345,10 +362,9 @@ class RealTimeSession(DividedSession):
         marked[gripped] = marked[tangent.held] = False
         nodes = np.flatnonzero(marked).astype(np.int64)
         if len(nodes) or len(gripped) or sides is not None:
-            condensed = self._condensed
-            if condensed is None or not condensed.serves(tangent, nodes, gripped):
-                yield from tangent.factors.prepared(np.concatenate([nodes, gripped]))
-                condensed = self._condensed = CondensedContact(tangent, nodes, self._stiffness_at(nodes, tangent), gripped)
+            condensed = yield from self._condensed_to(tangent, nodes, gripped, trial)
+            if condensed is None:
+                return None
             nodes = condensed.nodes
             places = [*self._places, *([self._engine._pairs] if lips else [])]
             law = ContactBesideTangent(nodes, trial.displacement, [*active, *lips], places, self._engine._surface, tangent, sides)
@@ -360,11 +376,11 @@ class RealTimeSession(DividedSession):
             extent, faint = self.engine._extent, self._engine.faint_mn
             longest = min(0.05 * extent, float(harmless_ways(self.indenters).min(initial=np.inf)))
             limits = (RUBBING, RUBBING) if self.engine.assembler.unsymmetric else (CHANGES, UNAIDED)
-            still, begins = (np.concatenate([motion[nodes], *_of_sides(sides, motion)]) for motion in (free, begin))
+            still, begins = (np.concatenate([motion[nodes], *motion_in_threes(sides, motion)]) for motion in (free, begin))
             alone = condensed.held(still, free[gripped])
             if sides is not None:
                 sides.slide(free)
-            force = yield from condensed.forces(alone, law, begins, 1e-5 * extent, longest, faint, *limits, self._patience)
+            force = yield from condensed.forces(alone, law, begins, 1e-5 * extent, longest, faint, *limits, self._sought_until())
             holding = condensed.holding(free[gripped], force)
             behind = len(nodes)
             tangent.factors.add_columns(np.concatenate([nodes, gripped]), np.concatenate([force[:behind], holding]), x)
@@ -373,6 +389,27 @@ class RealTimeSession(DividedSession):
                 x += tangent.factors.solve(sides.on_nodes(force[behind:], apart, tangent.held, len(free)))
         free[self._constrained] = 0.0
         return free
+
+    def _condensed_to(
+        self, tangent: EarlierTangent, nodes: IntArray, gripped: IntArray, trial: Trial
+    ) -> Generator[None, None, CondensedContact | None]:
+        """Return the contact condensed to nodes (k,), beside gripped ones (g,); None where the columns of the inverse take too long.
+
+        A trial that is thrown far off touches hundreds of nodes that a tangent was not prepared for, and leads nowhere.
+        """
+        condensed = self._condensed
+        if condensed is not None and condensed.serves(tangent, nodes, gripped):
+            return condensed
+        both = np.concatenate([nodes, gripped])
+        many = np.count_nonzero(~tangent.factors.covered(both)) > UNFORESEEN
+        if many and trial.error > UNLIKELY and self._duration == self.engine.step:
+            return None
+        for _ in tangent.factors.prepared(both):
+            if time.thread_time() > self._patience:
+                return None
+            yield
+        self._condensed = CondensedContact(tangent, nodes, self._stiffness_at(nodes, tangent), gripped)
+        return self._condensed
 
     def _approaching(self, tangent: EarlierTangent, displacement: FloatArray) -> ApproachingLips | None:
         """Return the pairs of the sides of cuts whose approach a tangent knows, at a displacement (n, 3), mm."""
@@ -409,8 +446,3 @@ class RealTimeSession(DividedSession):
 
     def _exerted(self, trial: Trial) -> FloatArray:
         return np.array([(trial.balance - trial.contact)[nodes].sum(axis=0) for nodes in self.bodies]).reshape(-1, 3)
-
-
-def _of_sides(sides: ApproachingLips | None, motion: FloatArray) -> list[FloatArray]:
-    """Return by how much pairs go apart as nodes move (n, 3), mm, in rows of three; nothing where there are no pairs."""
-    return [] if sides is None else [in_threes(sides.motion(motion))]
