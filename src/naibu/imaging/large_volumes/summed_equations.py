@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy import ndimage
@@ -17,6 +18,7 @@ from naibu.imaging.large_volumes.block_frame import BlockFrame
 from naibu.imaging.large_volumes.block_sums import CLASSES, ComparedBlock, FieldState, Stage
 from naibu.imaging.large_volumes.fine_outline import BAND
 from naibu.imaging.large_volumes.noise_tiles import NoiseTiles
+from naibu.imaging.large_volumes.pass_schedule import Schedule
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.morphology import dilated
 from naibu.imaging.preprocessing.object_mask import object_threshold
@@ -25,11 +27,13 @@ from naibu.imaging.volume_correlation.correlate import (
     ADAPTATION_SAMPLES,
     ADAPTATIONS,
     LEVELS,
+    MIXED,
     UNSETTLED,
     Correlation,
 )
 from naibu.imaging.volume_correlation.gauss_newton import (
     COVARIANCE_TOLERANCE,
+    REGULAR,
     SAMPLE_TOLERANCE,
     SAMPLES_AT_ONCE,
     STEP_TOLERANCE,
@@ -37,15 +41,13 @@ from naibu.imaging.volume_correlation.gauss_newton import (
 )
 from naibu.imaging.volume_correlation.image_level import GAIN_RANGE, GainMap, most_probable_gain
 from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
+from naibu.imaging.volume_correlation.mixed_steps import MixedSteps
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
 from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, blocks_alike, displacement_of_blocks
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.results.hidden_dilatation import loaded_trial_parts
 from naibu.imaging.volume_correlation.splines._spline_kernels import product
 from naibu.imaging.volume_correlation.volume_changes import LATE_DRAWS
-
-# Gauss-Newton steps: the first of them with voxels of an edge in between, where there are such, and the one in which weights are adapted
-ROUGH_PASSES, ADAPTED_PASS, LEAST_PASSES, PASSES = 3, 5, 6, 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +68,8 @@ class Model:
         How many there were.
     settled : bool
         Whether the last step was short.
+    steps : MixedSteps
+        Those before, at these voxels and weights.
     """
 
     coefficients: FloatArray
@@ -79,6 +83,7 @@ class Model:
     pairs: AnyFloatArray | None = None
     passes: int = 0
     settled: bool = False
+    steps: MixedSteps = field(default_factory=lambda: MixedSteps(MIXED))
 
 
 class SummedEquations:
@@ -99,6 +104,7 @@ class SummedEquations:
         self.coarse, self.fit, self.system, self.volume = coarse, fit, fit.system, volume
         self.lattice = GainMap(fit.level, fit.settings.gain_cell_mm or float(fit.level.spacing.max()) * max(fit.level.mask.shape))
         self.frame = self._frame(factor)
+        self.schedule = Schedule.of(factor)
         # coarse voxels are in a given mask, too, where little of them is: no error is stated where the object hardly is
         within = ndimage.binary_erosion(coarse.mask, border_value=1) if factor > 1 else coarse.mask
         fit.within = within[tuple(fit.level.index.astype(int).T[::-1])]
@@ -139,21 +145,22 @@ class SummedEquations:
     @property
     def frames(self) -> list[BlockFrame]:
         """The frames of the passes."""
-        factor = self.frame.factor
-        rough = self.frame.thinned(2) if factor > 2 and factor % 2 == 0 else self.frame
-        return [rough] * ROUGH_PASSES + [self.frame] * (PASSES - ROUGH_PASSES)
+        plan = self.schedule
+        rough = [self.frame.thinned(2)] if plan.rough else []
+        return rough * plan.rough + [self.frame] * (plan.most - plan.rough)
 
     def state(self, stage: Stage, edges: tuple[int, ...]) -> FieldState:
         """Return at what blocks with these edges are compared."""
         model, seed = self.model, self.coarse.settings.seed
-        adapted = self.adapting and model.passes + 1 == ADAPTED_PASS
+        plan, number = self.schedule, model.passes + 1
+        adapted = self.adapting and number == plan.adapted
         dense = np.zeros((*self.frame.cells.shape, 3, 3), np.float32)
         dense[tuple(self.system.cells[:, 2:].T)] = model.reliability
         draws = {"noise": 0, "step": ADAPTATION_SAMPLES if adapted else 0, "covariance": self.coarse.settings.samples}[stage]
         tiles = None
         if (stage == "covariance" or adapted) and model.products is not None and model.pairs is not None:
             tiles = NoiseTiles.for_blocks(edges, seed, model.products, model.pairs)
-        lagged = stage == "step" and (model.passes + 1 >= LEAST_PASSES or (self.adapting and model.passes + 1 == ADAPTED_PASS - 1))
+        lagged = stage == "step" and (number >= plan.least or (self.adapting and number == plan.adapted - 1))
         return FieldState(
             stage, model.coefficients, model.gain, model.residual_sd, model.jitter_voxels, dense, draws, lagged, tiles, seed + model.passes
         )
@@ -173,20 +180,23 @@ class SummedEquations:
     def stepped(self, blocks: Iterable[ComparedBlock | None]) -> Model:
         """Return the model after a Gauss-Newton step with the sums of all blocks, and weights adapted to them."""
         sums, coarse = self._added(blocks), self.coarse
-        before, passes = self.model.coefficients, self.model.passes + 1
+        before, passes, plan = self.model.coefficients, self.model.passes + 1, self.schedule
         coarse.c, coarse.bending, coarse.dilatation = before.copy(), self.model.bending, self.model.dilatation
         self._settle(sums, before)
-        if self.adapting and passes == ADAPTED_PASS:
+        if self.adapting and passes == plan.adapted:
             self._adapt(sums, before)
         self._settle(sums, before)
+        found = self._with_intensities(sums)
+        steps = MixedSteps(MIXED) if plan.is_first_of_its_kind(passes) else deepcopy(self.model.steps)
+        found = replace(found, gain=self._mixed(sums, steps, before, found.gain))
         self._take_step(before)
         jitter = self.model.jitter_voxels
-        if self.adapting and passes == ADAPTED_PASS - 1:
+        if self.adapting and passes == plan.adapted - 1:
             jitter = self.fit.bounded_jitter(float(np.sqrt(sums.jitter / sums.seen)))
         return replace(
-            self._with_intensities(sums), jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending,
-            dilatation=coarse.dilatation, passes=passes,
-            settled=passes >= LEAST_PASSES and self.fit.moving_fraction <= UNSETTLED, products=sums.products, pairs=sums.pairs,
+            found, jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending,
+            dilatation=coarse.dilatation, passes=passes, steps=steps,
+            settled=passes >= plan.least and self.fit.moving_fraction <= UNSETTLED, products=sums.products, pairs=sums.pairs,
         )  # fmt: skip
 
     def result(self, blocks: Iterable[ComparedBlock | None]) -> CorrelationResult:
@@ -245,6 +255,22 @@ class SummedEquations:
             self._settle(sums, before, 2)
             if settled:
                 break
+
+    def _mixed(self, sums: _Sums, steps: MixedSteps, before: FloatArray, gain: FloatArray) -> FloatArray:
+        """Mix the step from coefficients `before`, and that to a `gain`, with earlier ones; return the gain.
+
+        Blocks are compared at a gain that was matched in the pass before, so that displacement and gain converge only together. Either is
+        weighed by what it changes of the intensities.
+        """
+        active, last = self.system.active, self.model.gain
+        step = (self.coarse.c - before)[active].astype(np.float32)
+        steep = np.sqrt(sums.misfit[:, 1].sum() / max(3 * len(sums.misfit), 1))
+        root = np.linalg.cholesky(sums.gain_matrix + REGULAR * np.trace(sums.gain_matrix) * np.eye(len(last)))
+        seen = np.concatenate([steep * self.system.at_middles(step).ravel(), root.T @ (gain - last)])
+        taken = steps.mixed(np.concatenate([step.ravel(), gain - last]), seen)
+        self.coarse.c = before.copy()
+        self.coarse.c[active] += taken[: step.size].reshape(step.shape)
+        return last + taken[step.size :]
 
     def _take_step(self, before: FloatArray) -> None:
         """Let the fit judge which cells still move: a tenth of a voxel of the volume, not of the coarse one."""

@@ -17,6 +17,7 @@ from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray
 from naibu.imaging.volume_correlation._warp_kernels import add_to_cells, shrink_gradients
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
+from naibu.imaging.volume_correlation.mixed_steps import MixedSteps
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
 from naibu.imaging.volume_correlation.rigid_parts.rigid_inclusions import RigidInclusion
 from naibu.imaging.volume_correlation.splines.normal_equations import SplineSystem
@@ -59,6 +60,8 @@ class Iterations:
         Fraction of the cells that have not converged, above which the steps go on, up to `MOST_STEPS`.
     tolerance : float
         Relative accuracy of the linear solves.
+    mixed : int
+        Earlier steps that every step is mixed with (`MixedSteps`); 0 for none.
     """
 
     most: int = 6
@@ -67,6 +70,7 @@ class Iterations:
     anchoring: float = 0.0
     unsettled: float = 1.0
     tolerance: float = STEP_TOLERANCE
+    mixed: int = 0
 
 
 class CorrelationFit(IntensityComparison):
@@ -127,7 +131,7 @@ class CorrelationFit(IntensityComparison):
     def iterate(self, c: FloatArray, bending: FloatArray, dilatation: FloatArray, times: Iterations) -> FloatArray:
         """Return the coefficients after Gauss-Newton steps from c; bending (m, 3) and dilatation (m,) are weights of the cells."""
         voxel = float(np.prod(self.level.spacing) ** (1 / 3))
-        first = None
+        first, steps = None, MixedSteps(times.mixed)
         for k in range(MOST_STEPS):
             if k >= times.most and self.moving_fraction <= times.unsettled:
                 break
@@ -139,10 +143,11 @@ class CorrelationFit(IntensityComparison):
                 self.anchor(first, times.anchoring)
             load = self.system.assembled(c, self.products, self.force, bending, dilatation)
             step, _ = self.system.solved(load, times.tolerance)
-            length = np.linalg.norm(self.system.at_middles(step), axis=1)
+            moved = self.system.at_middles(step)
+            length = np.linalg.norm(moved, axis=1)
             far = float(np.percentile(length, 95))
             shrink = min(1.0, times.limit_voxels * voxel / max(far, 1e-30))
-            self.last_step = shrink * step
+            self.last_step = steps.mixed(shrink * step, shrink * moved.ravel())
             c = c.copy()
             c[self.system.active] += self.last_step
             if shrink * float(np.sqrt((length**2).mean())) < times.stop_voxels * voxel:
