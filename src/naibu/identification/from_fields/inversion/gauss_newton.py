@@ -229,13 +229,24 @@ def step_of(at: Linearised, objective: Objective, data: Concentrated) -> Step:
     free = objective.free(theta, gradient)
     step = np.zeros_like(theta)
     try:
-        step[free] = -sl.cho_solve(sl.cho_factor(hessian[np.ix_(free, free)]), gradient[free])
+        step[free] = _bounded(-sl.cho_solve(sl.cho_factor(hessian[np.ix_(free, free)]), gradient[free]), hessian[np.ix_(free, free)])
     except np.linalg.LinAlgError as error:
         raise ConvergenceError("the measured fields do not determine some moduli; measure more points, or join zones") from error
-    step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
     promise = -float(gradient @ step + 0.5 * step @ hessian @ step)
     loaded = 0.5 * sum(float(r @ p) for r, p in zip(data.offset, at.gradient()[1], strict=True))
     return Step(step, data.loaded(step), promise + loaded, float(np.sqrt(max(step @ hessian @ step, 0.0))), data.response)
+
+
+def _bounded(step: FloatArray, hessian: FloatArray) -> FloatArray:
+    """Return a step (k,) no logarithm of which is longer than `LONGEST_STEP`, shortened along each eigenvector of the Hessian (k, k) first.
+
+    Shortened as a whole only, a step that is endless along what the data hardly determine would be none along what they do determine.
+    """
+    if not np.abs(step).max(initial=0.0) > LONGEST_STEP:
+        return step
+    vectors = np.linalg.eigh(hessian)[1]
+    step = vectors @ np.clip(vectors.T @ step, -LONGEST_STEP, LONGEST_STEP)
+    return np.asarray(step * min(1.0, LONGEST_STEP / float(np.abs(step).max())))
 
 
 def search(

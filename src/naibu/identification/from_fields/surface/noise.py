@@ -22,10 +22,12 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, modulus_columns
+from naibu.identification.from_fields.uncertainty import UNBOUNDED
 
 DRAWS = 16  # of motions
 SMALL_STRAIN = 1e-4  # of the derivative of the tangent
 MOST = 0.8  # of the information, in any combination of moduli, that may be that of noise: what is left determines too little to be scaled
+LEAST_INFORMATION = (1.96 / np.log(UNBOUNDED)) ** 2  # on a combination of logarithms, below which its 95 % interval has no bounds
 UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the scaled information below which a combination is not determined
 Motions = list[FloatArray]  # displacements (n d, k), mm, of every load case
 
@@ -62,9 +64,22 @@ class CorrectedInformation:
         return np.asarray(self.root * (1.0 - self.parts) ** 2 @ self.root.T)
 
     def step(self, gradient: FloatArray) -> FloatArray:
-        """Return the change (k,) of the logarithms that a gradient (k,) of the objective makes, with a minus sign."""
-        inverse = np.linalg.pinv(self.root, rcond=1e-9)
-        return np.asarray(inverse.T @ ((inverse @ gradient) / (1.0 - self.parts)))
+        """Return the change (k,) of the logarithms that a gradient (k,) of the objective makes, with a minus sign.
+
+        Combinations of logarithms that have no bounds (see `told`) are left where they are.
+        """
+        inverse, kept = np.linalg.pinv(self.root, rcond=1e-9), told(self.matrix)[1]
+        return np.asarray(kept @ (kept.T @ (inverse.T @ ((inverse @ gradient) / (1.0 - self.parts)))))
+
+
+def told(information: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return eigenvalues (r,) and eigenvectors (k, r) of information (k, k) on logarithms, but for combinations that have no bounds.
+
+    Along those, gradients are divided by next to nothing: such a step leads to moduli of no meaning, beyond all that can be computed with.
+    """
+    values, vectors = np.linalg.eigh(information)
+    kept = values > LEAST_INFORMATION
+    return values[kept], vectors[:, kept]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
