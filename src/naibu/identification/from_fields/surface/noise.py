@@ -22,12 +22,11 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, modulus_columns
-from naibu.identification.from_fields.uncertainty import UNBOUNDED
+from naibu.identification.from_fields.uncertainty import told
 
 DRAWS = 16  # of motions
 SMALL_STRAIN = 1e-4  # of the derivative of the tangent
 MOST = 0.8  # of the information, in any combination of moduli, that may be that of noise: what is left determines too little to be scaled
-LEAST_INFORMATION = (1.96 / np.log(UNBOUNDED)) ** 2  # on a combination of logarithms, below which its 95 % interval has no bounds
 UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the scaled information below which a combination is not determined
 Motions = list[FloatArray]  # displacements (n d, k), mm, of every load case
 
@@ -70,16 +69,6 @@ class CorrectedInformation:
         """
         inverse, kept = np.linalg.pinv(self.root, rcond=1e-9), told(self.matrix)[1]
         return np.asarray(kept @ (kept.T @ (inverse.T @ ((inverse @ gradient) / (1.0 - self.parts)))))
-
-
-def told(information: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return eigenvalues (r,) and eigenvectors (k, r) of information (k, k) on logarithms, but for combinations that have no bounds.
-
-    Along those, gradients are divided by next to nothing: such a step leads to moduli of no meaning, beyond all that can be computed with.
-    """
-    values, vectors = np.linalg.eigh(information)
-    kept = values > LEAST_INFORMATION
-    return values[kept], vectors[:, kept]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
