@@ -14,8 +14,8 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised
+from naibu.identification.from_fields.inversion.told_combinations import told
 from naibu.identification.from_fields.mesh_error import Refit, refitted
-from naibu.identification.from_fields.uncertainty import told
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -22,6 +22,7 @@ from naibu.core.status import Status
 from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE, KeptPreconditioners
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
 from naibu.identification.from_fields.inversion.regularization import Regularization
+from naibu.identification.from_fields.inversion.told_combinations import told
 
 SMOOTHER = (10.0, 100.0)  # times as strong as it is: the prior on the motion of loaded nodes with which a body may follow a first one
 LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
@@ -269,14 +270,16 @@ def step_of(at: Linearised, objective: Objective, data: Concentrated) -> Step:
 
 
 def _bounded(step: FloatArray, hessian: FloatArray) -> FloatArray:
-    """Return a step (k,) no logarithm of which is longer than `LONGEST_STEP`, shortened along each eigenvector of the Hessian (k, k) first.
+    """Return a step (k,) no logarithm of which is longer than `LONGEST_STEP`, along combinations (see `told`) without bounds first.
 
-    Shortened as a whole only, a step that is endless along what the data hardly determine would be none along what they do determine.
+    Shortened as a whole only, a step that is endless along these would be none along what the data do determine.
     """
     if not np.abs(step).max(initial=0.0) > LONGEST_STEP:
         return step
-    vectors = np.linalg.eigh(hessian)[1]
-    step = vectors @ np.clip(vectors.T @ step, -LONGEST_STEP, LONGEST_STEP)
+    kept = told(hessian)[1]
+    determined = kept @ (kept.T @ step)
+    rest = step - determined
+    step = determined + rest * min(1.0, LONGEST_STEP / max(float(np.abs(rest).max()), 1e-300))
     return np.asarray(step * min(1.0, LONGEST_STEP / float(np.abs(step).max())))
 
 

@@ -27,9 +27,9 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
 from naibu.identification.from_fields.inversion.gauss_newton import LONGEST_STEP, Objective
+from naibu.identification.from_fields.inversion.told_combinations import told
 from naibu.identification.from_fields.mesh_error import change_of_fit
 from naibu.identification.from_fields.surface.noise import CorrectedInformation, tangent_columns
-from naibu.identification.from_fields.uncertainty import told
 
 # part of the bias that is reckoned with as a standard deviation after it was taken off: to first order, and from a biased motion
 LEFT = 0.5

@@ -22,7 +22,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, modulus_columns
-from naibu.identification.from_fields.uncertainty import told
+from naibu.identification.from_fields.inversion.told_combinations import told
 
 DRAWS = 16  # of motions
 SMALL_STRAIN = 1e-4  # of the derivative of the tangent
