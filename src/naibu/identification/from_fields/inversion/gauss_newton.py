@@ -188,8 +188,8 @@ StepRule = Callable[[Linearised, Objective, list[FloatArray] | None], Step]
 def first_point(model: FieldModel, theta: FloatArray) -> Point:
     """Return the point at these moduli at which the loaded components suit the measurements, by small strain first.
 
-    Where measurements are in error by more than their noise, and nothing was measured at the surface itself, the motion that suits them best
-    at small strain may be one that no body of finite strain follows. Smoother ones are then the start (see `SMOOTHER`).
+    Where measurements are in error by more than their noise, and nothing was measured at the surface itself, the motion that suits them
+    best at small strain may be one that no body of finite strain follows. Smoother ones are then the start (see `SMOOTHER`).
 
     Raises
     ------
