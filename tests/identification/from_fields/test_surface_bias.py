@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from gel_on_a_pad import SD_MM, TRUTH, gel_on_a_pad
+from gel_under_a_plate import GEL_KPA, gel_under_a_plate
 
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
@@ -76,3 +77,13 @@ def test_the_slope_of_what_measurements_determine_is_its_difference(law: LawName
     step = 1e-3 * np.eye(2)
     difference = [(informed(TRUTH + e) - informed(TRUTH - e)) / 2e-3 for e in step]
     np.testing.assert_allclose(slope, difference, atol=0.05)  # random signs
+
+
+@pytest.mark.filterwarnings("error")
+def test_moduli_that_a_known_zone_tells_nothing_of_keep_their_values_and_have_no_bounds() -> None:
+    mesh, zones, load_case = gel_under_a_plate()
+    found = identify_field(mesh, [load_case], zones, law="neo_hookean")
+    young, poisson = found.intervals()
+    np.testing.assert_array_equal(young, [[0.0, np.inf]] * 2)
+    assert np.isfinite(found.young_modulus).all() and (found.young_modulus > 1e-4 * GEL_KPA).all()
+    assert (poisson[:, 0] <= 0.45).all() and (poisson[:, 1] >= 0.45).all()

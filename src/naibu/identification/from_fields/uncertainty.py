@@ -16,12 +16,12 @@ from naibu.identification.from_fields.forward.field_laws import FieldElements, L
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point, logarithms, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Objective
+from naibu.identification.from_fields.inversion.told_combinations import UNBOUNDED
 from naibu.identification.from_fields.inversion.truncated_newton import RegularizedSystem, conjugate_gradients
 from naibu.identification.verdict import UNDETERMINED
 
 UNKNOWN_BELOW = 1e-12  # fraction of the largest eigenvalue of the information below which a combination is not determined at all
 PROBES, RESOLUTION_SOLVED = 24, 0.03  # random vectors, and what solutions leave of them: less than what so few leave in doubt
-UNBOUNDED = 1e3  # a factor between estimate and bound beyond which the data give no bound
 WELL, POORLY = 0.1, 0.5  # standard deviations of a logarithm of a modulus that are called well and poorly determined
 POISSON_POORLY = 0.1
 NOT_DETERMINED, NOT_USABLE = "not determined", "not to be used"

@@ -14,6 +14,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised
+from naibu.identification.from_fields.inversion.told_combinations import told
 from naibu.identification.from_fields.mesh_error import Refit, refitted
 
 
@@ -28,7 +29,7 @@ class Asked:
     size : float
         Inverse variance of `part` for whitened residuals of unit variance, independent of each other.
     theta : ndarray, shape (2 count,)
-        By how much ln mu and ln(kappa / mu) of the zones change with the whole of it.
+        By how much ln mu and ln(kappa / mu) of the zones change with the whole of it, but for combinations of these without bounds.
     """
 
     part: float
@@ -69,7 +70,10 @@ class ScoreTest:
             left, errors, slope = left[:, rows], errors[:, rows], slope[:, rows]
         slope = _beside(slope, errors)
         size = _product(slope, slope)
-        return Asked(-_product(left, slope) / size, size, changed.theta - self.theta) if size > 0.0 else None
+        if not size > 0.0:
+            return None
+        kept = told(self.quadratic.hessian)[1]
+        return Asked(-_product(left, slope) / size, size, kept @ (kept.T @ (changed.theta - self.theta)))
 
 
 def _left(at: Linearised, refit: Refit) -> FloatArray:

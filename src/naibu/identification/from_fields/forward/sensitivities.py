@@ -189,11 +189,11 @@ class FieldModel:
             factors.append(factor)
         return states, factors
 
-    def from_rest(self, theta: FloatArray, moved: Sequence[FloatArray]) -> list[FloatArray]:
-        """Return states (n, d), mm, reached in load steps, for displacements of the loaded components (n, d)."""
+    def from_rest(self, theta: FloatArray, moved: Sequence[FloatArray], *, at_length: bool = True) -> list[FloatArray]:
+        """Return states (n, d), mm, reached in load steps, for displacements of the loaded components (n, d); see `loaded_from_rest`."""
         lame, shear = moduli_of(self.zones, theta)
         pairs = zip(self.observed, moved, strict=True)
-        return [loaded_from_rest(self.law, self.points, lame, shear, o.load_case, u) for o, u in pairs]
+        return [loaded_from_rest(self.law, self.points, lame, shear, o.load_case, u, at_length=at_length) for o, u in pairs]
 
     def linearised(self, point: Point) -> Linearised:
         """Linearise all load cases at a point."""

@@ -7,7 +7,8 @@ minimised, weighted by the covariance of the measurement.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import scipy.linalg as sl
@@ -18,10 +19,12 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.core.progress import Progress, report_progress
 from naibu.core.status import Status
-from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
+from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE, KeptPreconditioners
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
 from naibu.identification.from_fields.inversion.regularization import Regularization
+from naibu.identification.from_fields.inversion.told_combinations import told
 
+SMOOTHER = (10.0, 100.0)  # times as strong as it is: the prior on the motion of loaded nodes with which a body may follow a first one
 LONGEST_STEP = 1.0  # of a logarithm of a modulus in one iteration
 SHORTEST_FRACTION = 1e-3  # of a step, below which the search ends
 NEGLIGIBLE = 1e-9  # by how much a step must promise to lower half of chi squared to be worth taking
@@ -185,28 +188,57 @@ StepRule = Callable[[Linearised, Objective, list[FloatArray] | None], Step]
 def first_point(model: FieldModel, theta: FloatArray) -> Point:
     """Return the point at these moduli at which the loaded components suit the measurements, by small strain first.
 
+    Where measurements are in error by more than their noise, and nothing was measured at the surface itself, the motion that suits them
+    best at small strain may be one that no body of finite strain follows. Smoother ones are then the start (see `SMOOTHER`).
+
     Raises
     ------
     ConvergenceError
         The measured field does not fix how the loaded nodes move, or a body of finite strain cannot follow.
     """
     small = model if model.law.linear else model.with_law("linear")
-    at = small.linearised(small.evaluate(theta, [np.zeros_like(model.points)] * len(model.observed)))
-    right = [-g[:, None] for g in at.gradient()[1]]
-    step = at.loaded_solved(right) if small is model else at.loaded_solved_once(right)
-    moved = at.forward(None, step)
-    states = [u + du.reshape(u.shape) for u, du in zip(at.point.states, moved, strict=True)]
+    states = _at_small_strain(small, theta, once=small is not model)
     if model.law.linear:
         return model.evaluate(theta, states)
-    try:
-        point = model.evaluate(theta, model.from_rest(theta, states))
-    except ConvergenceError as error:
-        raise ConvergenceError(f"{CANNOT_FOLLOW} ({str(error).partition('. ')[0]})") from error
+    point = _reached(model, theta, states) or _smoother(model, small, theta)
+    if point is None:
+        try:
+            point = model.evaluate(theta, model.from_rest(theta, states))
+        except ConvergenceError as error:
+            raise ConvergenceError(f"{CANNOT_FOLLOW} ({str(error).partition('. ')[0]})") from error
     model.boundary.keep_all(small.boundary)  # of thousands of components one takes as long as several iterations of a search
     at = model.linearised(point)
     for t in range(len(model.observed)):
         at.boundary(t)  # after which it is known how many loaded components the measurements determine
     return point
+
+
+def _at_small_strain(small: FieldModel, theta: FloatArray, *, once: bool) -> list[FloatArray]:
+    """Return the displacement (n, d), mm, of every load case with which its loaded components suit the measurements, solved `once` only."""
+    at = small.linearised(small.evaluate(theta, [np.zeros_like(small.points)] * len(small.observed)))
+    right = [-g[:, None] for g in at.gradient()[1]]
+    moved = at.forward(None, at.loaded_solved_once(right) if once else at.loaded_solved(right))
+    return [u + du.reshape(u.shape) for u, du in zip(at.point.states, moved, strict=True)]
+
+
+def _smoother(model: FieldModel, small: FieldModel, theta: FloatArray) -> Point | None:
+    """Return the point that a smoother motion of the loaded components leads to; None if a body follows none of them."""
+    for firmer in SMOOTHER:
+        other = copy(small)
+        other.observed = tuple(replace(o, prior=firmer**2 * o.prior) for o in small.observed)
+        other.boundary = KeptPreconditioners.none(other.observed)
+        point = _reached(model, theta, _at_small_strain(other, theta, once=True))
+        if point is not None:
+            return point
+    return None
+
+
+def _reached(model: FieldModel, theta: FloatArray, moved: list[FloatArray]) -> Point | None:
+    """Return the point to which the loaded components move as in `moved` (n, d), mm; None where Newton's method fails on short steps."""
+    try:
+        return model.evaluate(theta, model.from_rest(theta, moved, at_length=False))
+    except ConvergenceError:
+        return None
 
 
 def exact_step(at: Linearised, objective: Objective, near: list[FloatArray] | None = None) -> Step:
@@ -229,13 +261,26 @@ def step_of(at: Linearised, objective: Objective, data: Concentrated) -> Step:
     free = objective.free(theta, gradient)
     step = np.zeros_like(theta)
     try:
-        step[free] = -sl.cho_solve(sl.cho_factor(hessian[np.ix_(free, free)]), gradient[free])
+        step[free] = _bounded(-sl.cho_solve(sl.cho_factor(hessian[np.ix_(free, free)]), gradient[free]), hessian[np.ix_(free, free)])
     except np.linalg.LinAlgError as error:
         raise ConvergenceError("the measured fields do not determine some moduli; measure more points, or join zones") from error
-    step *= min(1.0, LONGEST_STEP / max(float(np.abs(step).max()), 1e-300))
     promise = -float(gradient @ step + 0.5 * step @ hessian @ step)
     loaded = 0.5 * sum(float(r @ p) for r, p in zip(data.offset, at.gradient()[1], strict=True))
     return Step(step, data.loaded(step), promise + loaded, float(np.sqrt(max(step @ hessian @ step, 0.0))), data.response)
+
+
+def _bounded(step: FloatArray, hessian: FloatArray) -> FloatArray:
+    """Return a step (k,) no logarithm of which is longer than `LONGEST_STEP`, along combinations (see `told`) without bounds first.
+
+    Shortened as a whole only, a step that is endless along these would be none along what the data do determine.
+    """
+    if not np.abs(step).max(initial=0.0) > LONGEST_STEP:
+        return step
+    kept = told(hessian)[1]
+    determined = kept @ (kept.T @ step)
+    rest = step - determined
+    step = determined + rest * min(1.0, LONGEST_STEP / max(float(np.abs(rest).max()), 1e-300))
+    return np.asarray(step * min(1.0, LONGEST_STEP / float(np.abs(step).max())))
 
 
 def search(

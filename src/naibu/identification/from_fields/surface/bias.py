@@ -12,6 +12,9 @@ number added the score has no bias, as corrected scores of measurement error mod
 
 The moduli without bias are where that corrected score vanishes. A step from the best fit finds them only where it is short: with few points
 the best fit is far on the side of soft, incompressible bodies, where measurements tell less, and the step is several times too long.
+
+Combinations of moduli without bounds, as all moduli next to a known zone so stiff that it is rigid, keep the best fit's values. Where a
+step leads to moduli of which fewer combinations have bounds, it is not made, and what the bias is there remains part of the intervals.
 """
 
 from __future__ import annotations
@@ -23,7 +26,8 @@ import numpy as np
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import ConvergenceError
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
-from naibu.identification.from_fields.inversion.gauss_newton import Objective
+from naibu.identification.from_fields.inversion.gauss_newton import LONGEST_STEP, Objective
+from naibu.identification.from_fields.inversion.told_combinations import told
 from naibu.identification.from_fields.mesh_error import change_of_fit
 from naibu.identification.from_fields.surface.noise import CorrectedInformation, tangent_columns
 
@@ -66,16 +70,30 @@ class CorrectedScore:
 
     @property
     def step(self) -> FloatArray:
-        """Change (2 count,) of the logarithms that would make it vanish, by no more than a standard deviation of each."""
-        inverse = np.linalg.pinv(self._hessian, rcond=1e-12)
-        sd = np.sqrt(np.abs(np.diag(inverse)))
-        return self._all(np.clip(-inverse @ self.value[self.free], -sd, sd))
+        """Change (2 count,) of the logarithms that would make it vanish, by no more than a standard deviation of each or `LONGEST_STEP`."""
+        values, vectors = self._told
+        sd = self._standard_deviations
+        step = np.clip(-vectors @ ((vectors.T @ self.value[self.free]) / values), -sd, sd)
+        return self._all(step * min(1.0, LONGEST_STEP / max(float(np.abs(step).max(initial=0.0)), 1e-300)))
 
     @property
     def is_short(self) -> bool:
         """Whether derivatives after that step are about those before it."""
-        sd = np.sqrt(np.abs(np.diag(np.linalg.pinv(self._hessian, rcond=1e-12))))
-        return bool((np.abs(self.step[self.free]) <= SHORT * sd).all())
+        return bool((np.abs(self.step[self.free]) <= SHORT * self._standard_deviations).all())
+
+    @property
+    def determined(self) -> int:
+        """Number of combinations of free logarithms that have bounds."""
+        return len(self._told[0])
+
+    @property
+    def _told(self) -> tuple[FloatArray, FloatArray]:
+        return told(self._hessian)
+
+    @property
+    def _standard_deviations(self) -> FloatArray:
+        values, vectors = self._told
+        return np.asarray(np.sqrt((vectors**2 / values).sum(axis=1)))
 
     @property
     def _hessian(self) -> FloatArray:
@@ -118,12 +136,13 @@ def without_bias(model: FieldModel, best: Point, objective: Objective, variance:
         here = score.at.point
         step = objective.clipped(here.theta + score.step) - here.theta
         motion = score.at.forward(step[:, None], [b[:, None] for b in score.quadratic.loaded(step)])
-        further = moved(model, here, step, [u[:, 0] for u in motion])
-        if further is None:
-            at = model.linearised(model.evaluate(here.theta, here.states))
-            return replace(score, at=at)
-        at = model.linearised(further)
-        score = CorrectedScore.of(at, at.concentrated(np.eye(2 * model.zones.count)), variance, objective)
+        further, new = moved(model, here, step, [u[:, 0] for u in motion]), None
+        if further is not None:
+            at = model.linearised(further)
+            new = CorrectedScore.of(at, at.concentrated(np.eye(2 * model.zones.count)), variance, objective)
+        if new is None or new.determined < score.determined:
+            return replace(score, at=model.linearised(model.evaluate(here.theta, here.states)))
+        score = new
     return score
 
 

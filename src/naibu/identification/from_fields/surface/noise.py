@@ -22,6 +22,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, modulus_columns
+from naibu.identification.from_fields.inversion.told_combinations import told
 
 DRAWS = 16  # of motions
 SMALL_STRAIN = 1e-4  # of the derivative of the tangent
@@ -62,9 +63,12 @@ class CorrectedInformation:
         return np.asarray(self.root * (1.0 - self.parts) ** 2 @ self.root.T)
 
     def step(self, gradient: FloatArray) -> FloatArray:
-        """Return the change (k,) of the logarithms that a gradient (k,) of the objective makes, with a minus sign."""
-        inverse = np.linalg.pinv(self.root, rcond=1e-9)
-        return np.asarray(inverse.T @ ((inverse @ gradient) / (1.0 - self.parts)))
+        """Return the change (k,) of the logarithms that a gradient (k,) of the objective makes, with a minus sign.
+
+        Combinations of logarithms that have no bounds (see `told`) are left where they are.
+        """
+        inverse, kept = np.linalg.pinv(self.root, rcond=1e-9), told(self.matrix)[1]
+        return np.asarray(kept @ (kept.T @ (inverse.T @ ((inverse @ gradient) / (1.0 - self.parts)))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
