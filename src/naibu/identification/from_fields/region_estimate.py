@@ -14,7 +14,13 @@ from naibu.identification.from_fields.assumptions.averaged_displacements import 
 from naibu.identification.from_fields.assumptions.known_ratios import asked_ratios, doubt_of_ratios, judged_ratios
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
 from naibu.identification.from_fields.assumptions.other_readings import covariance_of_readings, judged_readings, other_readings
-from naibu.identification.from_fields.assumptions.scaled_displacements import EXPLAINS, asked_scaling, doubt_of_scaling, judged_scaling
+from naibu.identification.from_fields.assumptions.scaled_displacements import (
+    EXPLAINS,
+    asked_scaling,
+    doubt_of_scaling,
+    judged_scaling,
+    unless_law,
+)
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
@@ -105,10 +111,12 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     by_elements = None if of_elements is None else replace(found.of_noise, covariance=of_elements).of_young_and_poisson(theta)[0]
     known = found.size.shift is not None and found.size.alike
     judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total, elements_known=known)
-    readings = other_readings(model, fit.point, 0.0 if free is None else free.fall, variance, settings.bounds)
+    of_free = 0.0 if free is None else free.fall
+    scaling = unless_law(scaling, judged, of_free)
+    readings = other_readings(model, fit.point, of_free, variance, settings.bounds)
     judged = judged_readings(judged, readings, model.zones, theta)
     judged = judged_averages(judged_ratios(judged, ratios, model.zones, theta), averages, model.zones, theta)
-    explained = max(0.0 if free is None else free.fall, *[one.fall for one in ratios], EXPLAINS * (found.misfit - fit.freedom))
+    explained = max(of_free, *[one.fall for one in ratios], EXPLAINS * (found.misfit - fit.freedom))
     judged = judged_scaling(judged, scaling, model.zones, theta, total, explained)
     doubts = doubt_of_averages(averages, len(theta)) + doubt_of_scaling(scaling, len(theta))
     total = total.with_added(covariance_of_readings(readings, len(theta)) + doubts)

@@ -16,7 +16,7 @@ from scipy.special import chdtrc
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.assumptions.assumed_law import UNLIKELY, told_changes
+from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, UNLIKELY, told_changes
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
@@ -78,6 +78,13 @@ def asked_scaling(test: ScoreTest, variance: float, stretch: FloatArray) -> Scal
     if best is None or len(AXES) * float(chdtrc(1, best.fall / variance)) >= UNLIKELY:  # of the least of so many by chance, at most
         return None
     return best
+
+
+def unless_law(found: Scaling | None, judged: Verdict, fall: float) -> Scaling | None:
+    """Return the growth; None where the verdict blames the law and chi squared falls with another one, by `fall`, at least as much."""
+    if found is None or (found.fall <= fall and any(reason.startswith(DOES_NOT_FIT) for reason in judged.reasons)):
+        return None
+    return found
 
 
 def judged_scaling(
