@@ -53,7 +53,10 @@ class Scaling:
 
 
 def asked_scaling(test: ScoreTest, variance: float, stretch: FloatArray) -> Scaling | None:
-    """Return the growth along the axis of which fields ask most, None where chance gives as much.
+    """Return the growth along the axis of which fields ask most, None where chance or errors of elements give as much.
+
+    What elements of half the size change of a growth is taken for one standard deviation of what elements leave in it; where that is not
+    known, no growth is asked for.
 
     Parameters
     ----------
@@ -64,20 +67,22 @@ def asked_scaling(test: ScoreTest, variance: float, stretch: FloatArray) -> Scal
     stretch : ndarray, shape (2 count,)
         By how much changes of logarithms are larger at vanishing element size.
     """
-    model, best = test.at.model, None
-    if model.mesh.dimension != 3:
+    model = test.at.model
+    if model.mesh.dimension != 3 or not test.errors.any():
         return None
     each = [_grown(model.computed, o, u) for o, u in zip(model.observed, test.at.point.states, strict=True)]
-    residuals = [np.ones(len(o.data), dtype=bool) for o in model.observed]
     most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
+    residuals = [np.ones(len(o.data), dtype=bool) for o in model.observed]
+    best, largest = None, 0.0
     for axis in range(len(AXES)):
         found = test.along([change[axis] for change in each], residuals)
-        fall = 0.0 if found is None else found.part**2 * found.size
-        if found is not None and (best is None or fall > best.fall):
-            best = Scaling(axis, found.part, fall, np.clip(found.part * stretch * found.theta, -most, most))
-    if best is None or len(AXES) * float(chdtrc(1, best.fall / variance)) >= UNLIKELY:  # of the least of so many by chance, at most
-        return None
-    return best
+        if found is None:
+            continue
+        score = found.part**2 / (variance / found.size + found.of_elements**2)
+        if score > largest:
+            largest = score
+            best = Scaling(axis, found.part, found.part**2 * found.size, np.clip(found.part * stretch * found.theta, -most, most))
+    return best if len(AXES) * float(chdtrc(1, largest)) < UNLIKELY else None  # of the largest of so many by chance, at most
 
 
 def unless_law(found: Scaling | None, judged: Verdict, fall: float) -> Scaling | None:
