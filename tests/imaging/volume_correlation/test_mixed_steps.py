@@ -10,7 +10,7 @@ from naibu.imaging.volume_correlation.mixed_steps import MixedSteps
 
 @pytest.mark.parametrize("depth", [1, 2, 3])
 def test_as_many_slow_errors_as_steps_are_mixed_end(depth: int) -> None:
-    """Linear fixed-point iterations, exact after depth + 2 steps, as GMRES is (Walker and Ni 2011, theorem 2.2); the first ends fast errors."""
+    """Linear iterations, exact after depth + 2 steps, as GMRES is (Walker and Ni 2011, theorem 2.2); the first step ends fast errors."""
     rng, steps = np.random.default_rng(depth), depth + 2
     axes = np.linalg.qr(rng.normal(size=(12, 12)))[0]
     left = axes[:, :depth] @ np.diag(np.linspace(0.8, 0.9, depth)) @ axes[:, :depth].T

@@ -14,6 +14,14 @@ from naibu.identification.from_fields.assumptions.averaged_displacements import 
 from naibu.identification.from_fields.assumptions.known_ratios import asked_ratios, doubt_of_ratios, judged_ratios
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
 from naibu.identification.from_fields.assumptions.other_readings import covariance_of_readings, judged_readings, other_readings
+from naibu.identification.from_fields.assumptions.scaled_displacements import (
+    EXPLAINS,
+    asked_scaling,
+    doubt_of_scaling,
+    judged_scaling,
+    unless_law,
+)
+from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
@@ -88,9 +96,10 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     finer = None if found.size.shift is None else found.size.residuals
     free, law = assumed_law.with_law_free(found.at, finer, fit.freedom, found.stretch)
     variance = found.shared * max(1.0, found.misfit / fit.freedom)
-    ratios = asked_ratios(found.at, found.quadratic, finer, variance, found.stretch)
+    test = ScoreTest.of(found.at, found.quadratic, finer)
+    ratios, scaling = asked_ratios(test, variance, found.stretch), asked_scaling(test, variance, found.stretch)
     judged, thin = _judged(fit, found, settings)
-    averages = averaging(found.at, found.quadratic, finer, found.size.residuals, found.stretch)
+    averages = averaging(test, found.size.residuals, found.stretch)
     of_elements, coarse = _of_elements(fit, found, settings, judged, thin)
     total = found.of_noise.with_added(of_known + doubt_of_ratios(ratios, len(of_known))).with_law(law)
     total = total if of_elements is None else total.with_added(of_elements)
@@ -102,10 +111,15 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     by_elements = None if of_elements is None else replace(found.of_noise, covariance=of_elements).of_young_and_poisson(theta)[0]
     known = found.size.shift is not None and found.size.alike
     judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total, elements_known=known)
-    readings = other_readings(model, fit.point, 0.0 if free is None else free.fall, variance, settings.bounds)
+    of_free = 0.0 if free is None else free.fall
+    scaling = unless_law(scaling, judged, of_free)
+    readings = other_readings(model, fit.point, of_free, variance, settings.bounds)
     judged = judged_readings(judged, readings, model.zones, theta)
     judged = judged_averages(judged_ratios(judged, ratios, model.zones, theta), averages, model.zones, theta)
-    total = total.with_added(covariance_of_readings(readings, len(theta)) + doubt_of_averages(averages, len(theta)))
+    explained = max(of_free, *[one.fall for one in ratios], EXPLAINS * (found.misfit - fit.freedom))
+    judged = judged_scaling(judged, scaling, model.zones, theta, total, explained)
+    doubts = doubt_of_averages(averages, len(theta)) + doubt_of_scaling(scaling, len(theta))
+    total = total.with_added(covariance_of_readings(readings, len(theta)) + doubts)
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))
     budget = ErrorBudget(found.of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), found.shared)

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.assumptions.free_law import FreeLaw, free_law
 from naibu.identification.from_fields.assumptions.other_assumptions import holds
@@ -105,14 +105,16 @@ def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray, *, elements_
     )
 
 
-def told_changes(zones: Zones, change: FloatArray) -> str:
+def told_changes(zones: Zones, change: FloatArray, beyond: BoolArray | None = None) -> str:
     """Return in words the largest changes of the logarithms of Young's moduli (count,) that matter; empty where none does.
 
+    Those do that are large, or where moduli leave their intervals (`beyond` (count,)).
     Where a single cell is all that is known, moduli are multiples of that of the largest zone.
     """
     if len(zones.known) == 1 and zones.known[0].is_unit and int((zones.of_cell == KNOWN).sum()) == 1:
         change = change - change[np.argmax(np.bincount(zones.of_cell[zones.of_cell != KNOWN], minlength=zones.count))]
-    moved = [i for i in np.argsort(-np.abs(change)).tolist() if abs(change[i]) > MODULUS]
+    matter = (np.abs(change) > MODULUS) | (False if beyond is None else beyond)
+    moved = [i for i in np.argsort(-np.abs(change)).tolist() if matter[i]]
     each = [
         f"that of {zones.names[i]} {100.0 * abs(np.expm1(change[i])):.0f} % {'higher' if change[i] > 0.0 else 'lower'}"
         for i in moved[:LISTED]

@@ -22,7 +22,7 @@ from naibu.identification.from_fields.assumptions.assumed_law import told_change
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
-from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.verdict import WITHIN_NOISE
 from naibu.identification.neighbours import neighbours
 from naibu.identification.verdict import Explanation, Verdict
@@ -63,23 +63,19 @@ class Averaging:
     theta: FloatArray
 
 
-def averaging(
-    at: Linearised, quadratic: Concentrated, finer: Sequence[FloatArray] | None, residuals: Sequence[FloatArray], stretch: FloatArray
-) -> Averaging | None:
+def averaging(test: ScoreTest, residuals: Sequence[FloatArray], stretch: FloatArray) -> Averaging | None:
     """Return what averages would mean for the moduli; None where residuals do not look like that.
 
     Parameters
     ----------
-    at, quadratic : Linearised, Concentrated
-        At the best fit.
-    finer : sequence of ndarray, shape (q,), or None
-        Whitened residuals of every load case on elements of half the size; None where these were not computed.
+    test : ScoreTest
+        Of the best fit.
     residuals : sequence of ndarray, shape (q,)
         The best whitened residuals that are known.
     stretch : ndarray, shape (2 count,)
         By how much changes of logarithms are larger at vanishing element size.
     """
-    model = at.model
+    at, model = test.at, test.at.model
     if model.mesh.dimension != 3:
         return None
     kernels = [kernel(o.points, r.reshape(len(o.points), -1)) for o, r in zip(model.observed, residuals, strict=True)]
@@ -87,7 +83,7 @@ def averaging(
         return None
     pairs = zip(model.observed, at.point.states, kernels, strict=True)
     changes, inside = zip(*(_blunted(model.computed, o, u, one.length_mm) for o, u, one in pairs), strict=True)
-    asked = ScoreTest.of(at, quadratic, finer).along(list(changes), inside)
+    asked = test.along(list(changes), inside)
     if asked is None:
         return None
     square = max(one.points * float((r**2).mean()) for one, r in zip(kernels, residuals, strict=True))

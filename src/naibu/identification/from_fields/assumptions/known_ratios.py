@@ -21,7 +21,7 @@ from naibu.identification.from_fields.assumptions.assumed_law import MODULUS, UN
 from naibu.identification.from_fields.assumptions.other_assumptions import changes_under, other_poisson_ratio
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.load_cases import Zones
-from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import moduli_of, young_and_poisson
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
@@ -42,6 +42,8 @@ class AskedRatio:
         Poisson's ratios.
     probability : float
         Of so large a score by chance.
+    fall : float
+        By how much chi squared falls with it.
     theta : ndarray, shape (2 count,)
         By how much ln mu and ln(kappa / mu) of the zones would change, to first order.
     """
@@ -50,27 +52,24 @@ class AskedRatio:
     stated: float
     asked: float
     probability: float
+    fall: float
     theta: FloatArray
 
 
-def asked_ratios(
-    at: Linearised, quadratic: Concentrated, finer: Sequence[FloatArray] | None, variance: float, stretch: FloatArray
-) -> tuple[AskedRatio, ...]:
+def asked_ratios(test: ScoreTest, variance: float, stretch: FloatArray) -> tuple[AskedRatio, ...]:
     """Return the ratios of known regions that fields contradict by more than is stated of them, and that matter.
 
     Parameters
     ----------
-    at, quadratic : Linearised, Concentrated
-        At the best fit.
-    finer : sequence of ndarray, shape (q,), or None
-        Whitened residuals of every load case on elements of half the size; None where these were not computed.
+    test : ScoreTest
+        Of the best fit.
     variance : float
         Of whitened residuals, errors that neighbours share counted.
     stretch : ndarray, shape (2 count,)
         By how much changes of logarithms are larger at vanishing element size.
     """
-    model, out = at.model, []
-    test, most = ScoreTest.of(at, quadratic, finer), np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
+    at, model, out = test.at, test.at.model, []
+    most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
     for number, region in enumerate(model.zones.known):
         lame, shear = moduli_of(model.zones, at.point.theta)
         cells, near = model.zones.region_of_cell == number, other_poisson_ratio(region.poisson_ratio)
@@ -85,7 +84,8 @@ def asked_ratios(
         part = (max(stated + found.part * (other - stated), _compressibility(MAX_POISSON_RATIO)) - stated) / (other - stated)
         asked = _poisson_ratio(stated + part * (other - stated))
         theta = np.clip(part * stretch * found.theta, -most, most)
-        one = AskedRatio(region.name, region.poisson_ratio, asked, float(chdtrc(1, found.part**2 * found.size / variance)), theta)
+        fall = found.part**2 * found.size
+        one = AskedRatio(region.name, region.poisson_ratio, asked, float(chdtrc(1, fall / variance)), fall, theta)
         matters = np.abs(_change(one, at.point.theta)).max(initial=0.0) > MODULUS
         if one.probability < UNLIKELY and matters and abs(asked - one.stated) > STATED_SD * region.poisson_ratio_sd:
             out.append(one)

@@ -30,11 +30,14 @@ class Asked:
         Inverse variance of `part` for whitened residuals of unit variance, independent of each other.
     theta : ndarray, shape (2 count,)
         By how much ln mu and ln(kappa / mu) of the zones change with the whole of it, but for combinations of these without bounds.
+    of_elements : float
+        By how much elements of half the size change `part` where their error is not taken off.
     """
 
     part: float
     size: float
     theta: FloatArray
+    of_elements: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,12 +71,13 @@ class ScoreTest:
         if counted is not None:
             rows = np.flatnonzero(np.concatenate(counted))
             left, errors, slope = left[:, rows], errors[:, rows], slope[:, rows]
-        slope = _beside(slope, errors)
+        whole, slope = slope, _beside(slope, errors)
         size = _product(slope, slope)
         if not size > 0.0:
             return None
+        of_elements = -_product(errors, whole) / _product(whole, whole)
         kept = told(self.quadratic.hessian)[1]
-        return Asked(-_product(left, slope) / size, size, kept @ (kept.T @ (changed.theta - self.theta)))
+        return Asked(-_product(left, slope) / size, size, kept @ (kept.T @ (changed.theta - self.theta)), of_elements)
 
 
 def _left(at: Linearised, refit: Refit) -> FloatArray:
