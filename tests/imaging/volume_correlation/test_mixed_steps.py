@@ -21,9 +21,3 @@ def test_as_many_slow_errors_as_steps_are_mixed_end(depth: int) -> None:
         x = x + mix.mixed(own, own)
     assert np.linalg.norm(left @ (x - right) + right - x) < 1e-10 * first
     assert np.linalg.norm(np.linalg.matrix_power(left, steps + 1) @ right) > 0.01 * first  # by themselves
-
-
-def test_without_earlier_steps_they_are_taken_as_they_are() -> None:
-    mix, own = MixedSteps(0), np.ones((2, 3), np.float32)
-    for _ in range(3):
-        assert mix.mixed(own, own.ravel().astype(float)) is own

@@ -405,7 +405,11 @@ def test_a_map_that_no_regions_explain_says_so_first(folder: Path, monkeypatch: 
 
 
 def test_a_surface_that_noise_folds_is_told_as_such(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Noise of 3 mm that counts as nearly none, in cubes of 4 mm: advice to refine them and to round off an indenter would mislead."""
+    """Noise of 3 mm that counts as nearly none, in cubes of 4 mm: advice to refine them and to round off an indenter would mislead.
+
+    A smoother motion of the surface that a body does follow is not tried: from there on the field is not explained.
+    """
+    monkeypatch.setattr("naibu.identification.from_fields.inversion.gauss_newton.SMOOTHER", ())
     monkeypatch.setattr("naibu.workflows.fields.object_on_cubes.with_noise_of_neighbours", lambda _, case: (case, 1.0))
     field = read_field(folder / "field.h5")
     noise = 3.0 * np.random.default_rng(5).standard_normal(field.vectors.shape)

@@ -27,7 +27,6 @@ from naibu.imaging.volume_correlation.correlate import (
     ADAPTATION_SAMPLES,
     ADAPTATIONS,
     LEVELS,
-    MIXED,
     UNSETTLED,
     Correlation,
 )
@@ -83,7 +82,7 @@ class Model:
     pairs: AnyFloatArray | None = None
     passes: int = 0
     settled: bool = False
-    steps: MixedSteps = field(default_factory=lambda: MixedSteps(MIXED))
+    steps: MixedSteps = field(default_factory=MixedSteps)
 
 
 class SummedEquations:
@@ -187,7 +186,7 @@ class SummedEquations:
             self._adapt(sums, before)
         self._settle(sums, before)
         found = self._with_intensities(sums)
-        steps = MixedSteps(MIXED) if plan.is_first_of_its_kind(passes) else deepcopy(self.model.steps)
+        steps = MixedSteps() if plan.is_first_of_its_kind(passes) else deepcopy(self.model.steps)
         found = replace(found, gain=self._mixed(sums, steps, before, found.gain))
         self._take_step(before)
         jitter = self.model.jitter_voxels

@@ -81,9 +81,8 @@ INCLUSION_STEPS, ADAPTED_STEPS = 3, 5  # Gauss-Newton steps with rigid inclusion
 SEARCHES, RELEASED_STEPS = 2, 2  # for parts that swell, and Gauss-Newton steps after each
 UNSETTLED = 0.05  # fraction of the cells that still move, above which these steps go on: large strains of small volumes need more
 MOST_STIFFER = 2.0  # median factor on the weights of bending, above which they are adapted once more
-MIXED = 2  # earlier steps that those after an adaptation are mixed with
 # the last steps are solved more exactly: what is left of a step is an error like any other
-POLISH = Iterations(6, stop_voxels=0.002, tolerance=0.03, mixed=MIXED)
+POLISH = Iterations(6, stop_voxels=0.002, tolerance=0.03, mixed=True)
 LEAST_WEIGHT = 1e-3  # of the dilatation weight of the round before
 DEFAULT = CorrelationSettings()
 
@@ -340,7 +339,7 @@ class Correlation:
             report_progress(self.progress, "weights of the penalties", done=k, total=ADAPTATIONS)
             weights = self.bending, self.dilatation * system.gauss_volume
             settled = self.reweigh(fit.samples(self.c, *weights, ADAPTATION_SAMPLES, None, s.seed, SAMPLE_TOLERANCE))
-            steps = Iterations(ADAPTED_STEPS, unsettled=UNSETTLED, mixed=MIXED)
+            steps = Iterations(ADAPTED_STEPS, unsettled=UNSETTLED, mixed=True)
             self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, steps)
             if settled:
                 break

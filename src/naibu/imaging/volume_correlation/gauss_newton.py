@@ -60,8 +60,8 @@ class Iterations:
         Fraction of the cells that have not converged, above which the steps go on, up to `MOST_STEPS`.
     tolerance : float
         Relative accuracy of the linear solves.
-    mixed : int
-        Earlier steps that every step is mixed with (`MixedSteps`); 0 for none.
+    mixed : bool
+        Whether steps are mixed with earlier ones (`MixedSteps`).
     """
 
     most: int = 6
@@ -70,7 +70,7 @@ class Iterations:
     anchoring: float = 0.0
     unsettled: float = 1.0
     tolerance: float = STEP_TOLERANCE
-    mixed: int = 0
+    mixed: bool = False
 
 
 class CorrelationFit(IntensityComparison):
@@ -131,7 +131,7 @@ class CorrelationFit(IntensityComparison):
     def iterate(self, c: FloatArray, bending: FloatArray, dilatation: FloatArray, times: Iterations) -> FloatArray:
         """Return the coefficients after Gauss-Newton steps from c; bending (m, 3) and dilatation (m,) are weights of the cells."""
         voxel = float(np.prod(self.level.spacing) ** (1 / 3))
-        first, steps = None, MixedSteps(times.mixed)
+        first, steps = None, MixedSteps()
         for k in range(MOST_STEPS):
             if k >= times.most and self.moving_fraction <= times.unsettled:
                 break
@@ -147,7 +147,7 @@ class CorrelationFit(IntensityComparison):
             length = np.linalg.norm(moved, axis=1)
             far = float(np.percentile(length, 95))
             shrink = min(1.0, times.limit_voxels * voxel / max(far, 1e-30))
-            self.last_step = steps.mixed(shrink * step, shrink * moved.ravel())
+            self.last_step = steps.mixed(shrink * step, shrink * moved.ravel()) if times.mixed else shrink * step
             c = c.copy()
             c[self.system.active] += self.last_step
             if shrink * float(np.sqrt((length**2).mean())) < times.stop_voxels * voxel:

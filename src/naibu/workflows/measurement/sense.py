@@ -295,7 +295,8 @@ def sense_pair(
 def recorded(pair: Pair, measured: MeasuredDisplacement, seconds: float, folder: Path | None) -> SenseRun:
     """Return a measured displacement with its figures, and write it where a folder is given (see `sense_pair`)."""
     if not (measured.mask & measured.displacement.valid).any():
-        raise InputError("the displacement was found nowhere in the object: check that both scans show the same object")
+        nowhere = "the displacement was found nowhere in the object: check that both scans show the same object"
+        raise InputError(". ".join([nowhere, *pair.notes]))
     if np.array_equal(pair.reference.values, pair.deformed.values, equal_nan=True):
         first, second = pair.names
         raise InputError(f"{first} and {second} hold the same intensities at every voxel, so that nothing moved; is one scan given twice?")
