@@ -6,7 +6,6 @@ import numpy as np
 
 from naibu.core.arrays import AnyFloatArray, FloatArray
 
-
 DEPTH = 2  # deeper ones gain nothing: empirical, on textured balls
 
 
