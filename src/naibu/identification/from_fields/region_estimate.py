@@ -10,14 +10,13 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumed_law
-from naibu.identification.from_fields.assumptions.averaged_displacements import averaging, doubt_of_averages, judged_averages
+from naibu.identification.from_fields.assumptions.averaged_displacements import averaging, judged_averages
 from naibu.identification.from_fields.assumptions.known_ratios import asked_ratios, doubt_of_ratios, judged_ratios
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
 from naibu.identification.from_fields.assumptions.other_readings import covariance_of_readings, judged_readings, other_readings
 from naibu.identification.from_fields.assumptions.scaled_displacements import (
     EXPLAINS,
     asked_scaling,
-    doubt_of_scaling,
     judged_scaling,
     unless_law,
 )
@@ -118,7 +117,7 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     judged = judged_averages(judged_ratios(judged, ratios, model.zones, theta), averages, model.zones, theta)
     explained = max(of_free, *[one.fall for one in ratios], EXPLAINS * (found.misfit - fit.freedom))
     judged = judged_scaling(judged, scaling, model.zones, theta, total, explained)
-    doubts = doubt_of_averages(averages, len(theta)) + doubt_of_scaling(scaling, len(theta))
+    doubts = sum(np.outer(one.theta, one.theta) for one in (averages, scaling) if one is not None)
     total = total.with_added(covariance_of_readings(readings, len(theta)) + doubts)
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))

@@ -127,11 +127,6 @@ def judged_averages(judged: Verdict, found: Averaging | None, zones: Zones, thet
     return replace(judged, explanation=part, reasons=(why, *judged.reasons) if first else (*judged.reasons, why))
 
 
-def doubt_of_averages(found: Averaging | None, size: int) -> FloatArray:
-    """Return what averages add to the second moment (size, size) of errors of theta."""
-    return np.zeros((size, size)) if found is None else np.outer(found.theta, found.theta)
-
-
 def _blunted(mesh: Mesh, o: Observed, u: FloatArray, length: float) -> tuple[FloatArray, BoolArray]:
     """Return what averages over a kernel change of the whitened displacement (q,) of a state (n, d), mm, and where kernels lie inside (q,).
 

@@ -19,14 +19,13 @@ from naibu.core.errors import ConvergenceError
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.from_fields.assumptions.assumed_law import MODULUS, UNLIKELY
 from naibu.identification.from_fields.assumptions.other_assumptions import changes_under, other_poisson_ratio
-from naibu.identification.from_fields.assumptions.score_test import ScoreTest
+from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import moduli_of, young_and_poisson
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 STATED_SD = 2.0  # stated standard deviations of a ratio within which another one is no contradiction
-MOST_OF_RATIO = 1.0  # change of ln(kappa / mu) that counts: near incompressibility it may be any, to first order
 DOES_NOT_FIT = "a stated Poisson's ratio does not fit"
 
 

@@ -17,7 +17,7 @@ from scipy.special import chdtrc
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, UNLIKELY, told_changes
-from naibu.identification.from_fields.assumptions.score_test import ScoreTest
+from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
@@ -26,7 +26,6 @@ from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.point_location import locate, operator_of
 
 AXES = "xyz"
-MOST_OF_RATIO = 1.0  # change of ln(kappa / mu) that counts: near incompressibility it may be any, to first order
 EXPLAINS = 0.5  # of what residuals are beyond noise: what explains less of it is no first reason
 SCALED = "as where a body creeps or relaxes while it is scanned"
 
@@ -111,11 +110,6 @@ def judged_scaling(
         f"explain, {SCALED}, or where the scale of displacements or the stiffness within a zone changes {along}: without that, {changes}"
     )
     return replace(judged, explanation=part, reasons=(why, *judged.reasons) if found.fall > explained else (*judged.reasons, why))
-
-
-def doubt_of_scaling(found: Scaling | None, size: int) -> FloatArray:
-    """Return what a growth of displacements adds to the second moment (size, size) of errors of theta."""
-    return np.zeros((size, size)) if found is None else np.outer(found.theta, found.theta)
 
 
 def _told(found: Scaling, zones: Zones, theta: FloatArray, total: Uncertainty) -> str:

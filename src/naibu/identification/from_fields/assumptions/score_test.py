@@ -17,6 +17,8 @@ from naibu.identification.from_fields.forward.sensitivities import Concentrated,
 from naibu.identification.from_fields.inversion.told_combinations import told
 from naibu.identification.from_fields.mesh_error import Refit, refitted
 
+MOST_OF_RATIO = 1.0  # change of ln(kappa / mu) that counts: near incompressibility it may be any, to first order
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Asked:
