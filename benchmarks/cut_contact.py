@@ -22,7 +22,7 @@ from naibu.mechanics.finite_strain.lip_assembly import with_lips
 from naibu.mechanics.finite_strain.problem import Problem
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.meshing import boundary_faces, box, cut_volume, swept_blade
-from naibu.simulation.cut_sides import outward_normals, softer_behind_cuts
+from naibu.simulation.cuts.cut_sides import outward_normals, softer_behind_cuts
 
 SIZE = 20.0
 PLANES = ((0.6, 0.0, 5), (0.47, 1.0, 5), (0.45, 4.0, 5), (0.3, 8.0, 6))  # height over the size, rise over it and 2 mm, cubes along an edge

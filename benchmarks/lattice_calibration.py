@@ -34,11 +34,11 @@ from naibu.identification.lattice_calibration.captured.recorded_forces import Re
 from naibu.identification.lattice_calibration.captured.sensor_errors import LITTLE_DRIFT, SensorErrorNames, SensorErrors
 from naibu.identification.lattice_calibration.evaluation import residuals_at
 from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD
-from naibu.identification.lattice_calibration.study_model import StudyModel
-from naibu.identification.lattice_calibration.study_problem import StudyProblem
-from naibu.identification.lattice_calibration.study_unknowns import FRICTION, SHIFT, StudyUnknowns
+from naibu.identification.lattice_calibration.studies.study_model import StudyModel
+from naibu.identification.lattice_calibration.studies.study_problem import StudyProblem
+from naibu.identification.lattice_calibration.studies.study_unknowns import FRICTION, SHIFT, StudyUnknowns
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy
-from naibu.workflows.studies.calibration_starts import searched
+from naibu.workflows.studies.calibration.starts import searched
 from naibu.workflows.studies.lattice_study import prepared_study
 
 Array = NDArray[np.float64]

@@ -27,7 +27,7 @@ from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.cpu.session import LatticeSession
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.lattices.simulation.adjoint import push_gradient, recorded_push
 

@@ -22,8 +22,8 @@ from naibu.core.arrays import FloatArray
 from naibu.core.rigid_transform import RigidTransform
 from naibu.mechanics import Assembler, DynamicEngine, QuasiStaticEngine, RealTimeEngine, elements, material, spherical_indenter
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
+from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
 from naibu.meshing import box, to_tetra
 from naibu.simulation import FiniteElementBody, InteractiveSimulation
 from naibu.workflows import tools_for, touchable

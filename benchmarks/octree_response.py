@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.octree import octree_cubes, octree_lattice
-from naibu.mechanics.lattices.model.octree_compliance_correction import lengthening
-from naibu.mechanics.lattices.model.octree_energy_scaling import OctreeGrid
+from naibu.mechanics.lattices.model.octrees.compliance_correction import lengthening
+from naibu.mechanics.lattices.model.octrees.energy_scaling import OctreeGrid
+from naibu.mechanics.lattices.model.octrees.octree import octree_cubes, octree_lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.linear_algebra.direct import direct_solver
 from naibu.mechanics.linear_algebra.protocols import Factorization

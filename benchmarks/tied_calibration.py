@@ -22,12 +22,12 @@ import numpy as np
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.captured.sensor_errors import SensorErrorNames, SensorErrors
 from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import fitted
-from naibu.identification.lattice_calibration.study_problem import StudyProblem
-from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.identification.lattice_calibration.studies.study_problem import StudyProblem
+from naibu.identification.lattice_calibration.studies.study_unknowns import StudyUnknowns
 from naibu.io.tables.captured_shapes import read_captured_shapes
 from naibu.io.tables.force_records import read_force_records
-from naibu.workflows.studies.calibrate import calibrate_study
-from naibu.workflows.studies.calibration_example import POINT_SD_MM, SOURCE, write_calibration_example
+from naibu.workflows.studies.calibration.calibrate import calibrate_study
+from naibu.workflows.studies.calibration.example import POINT_SD_MM, SOURCE, write_calibration_example
 from naibu.workflows.studies.lattice_study import prepared_study
 
 

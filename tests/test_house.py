@@ -203,7 +203,7 @@ def test_importing_naibu_is_fast() -> None:
 
 def test_verbs_start_without_what_they_seldom_need() -> None:
     """Statistics took a third of the start of each worker of a calibration."""
-    workflows = ("fields.identify_fields", "markers.identify", "measurement.sense", "studies.calibrate", "studies.simulate")
+    workflows = ("fields.identify_fields", "markers.identify", "measurement.sense", "studies.calibration.calibrate", "studies.simulate")
     names = loaded_modules("import " + ", ".join(f"naibu.workflows.{name}" for name in workflows))
     assert not {"scipy.stats", "scipy.signal"} & names
 

@@ -11,7 +11,7 @@ from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicState
 from naibu.meshing import box, to_tetra
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.simulation import FiniteElementBody
-from naibu.simulation.background_cut import BackgroundCut
+from naibu.simulation.cuts.background_cut import BackgroundCut
 
 SIZE = 40.0  # mm
 

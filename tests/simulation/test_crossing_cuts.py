@@ -14,7 +14,7 @@ from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSes
 from naibu.meshing import box, to_tetra
 from naibu.meshing.quality import smallest_dihedral_angle
 from naibu.simulation import FiniteElementBody, InteractiveSimulation
-from naibu.simulation.lattice_cut import LatticeCut
+from naibu.simulation.cuts.lattice_cut import LatticeCut
 
 SIZE = 60.0  # mm
 STEPS = 8  # behind every cut

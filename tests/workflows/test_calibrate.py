@@ -20,14 +20,14 @@ from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.progress import ProgressReport
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
-from naibu.identification.lattice_calibration.study_model import StudyModel
-from naibu.identification.lattice_calibration.study_problem import StudyProblem
-from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.identification.lattice_calibration.studies.study_model import StudyModel
+from naibu.identification.lattice_calibration.studies.study_problem import StudyProblem
+from naibu.identification.lattice_calibration.studies.study_unknowns import StudyUnknowns
 from naibu.workflows.parallel.task import Task
-from naibu.workflows.studies import calibration_starts
-from naibu.workflows.studies.calibrate import calibrate_study
-from naibu.workflows.studies.calibration_example import write_calibration_example
-from naibu.workflows.studies.calibration_starts import StartedSearch, best_of, starting_values
+from naibu.workflows.studies.calibration import starts as calibration_starts
+from naibu.workflows.studies.calibration.calibrate import calibrate_study
+from naibu.workflows.studies.calibration.example import write_calibration_example
+from naibu.workflows.studies.calibration.starts import StartedSearch, best_of, starting_values
 from naibu.workflows.studies.lattice_study import prepared_study
 
 STUDY = """

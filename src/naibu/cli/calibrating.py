@@ -19,7 +19,7 @@ from naibu.core.errors import InputError
 from naibu.core.progress import ProgressReport
 
 if TYPE_CHECKING:
-    from naibu.workflows.studies.calibrate import LatticeCalibration
+    from naibu.workflows.studies.calibration.calibrate import LatticeCalibration
 
 
 @verb(
@@ -106,7 +106,7 @@ def calibrate(
         return
     if not study:
         raise InputError("naibu calibrate needs STUDY; naibu calibrate --example dough writes inputs to try it with")
-    from naibu.workflows.studies.calibrate import calibrate_study
+    from naibu.workflows.studies.calibration.calibrate import calibrate_study
 
     began = time.perf_counter()
     with stopped_gently("simulation") as stopping, progress_display() as display:
@@ -130,7 +130,7 @@ def calibrate(
 
 
 def _write_example(folder: Path, seed: int, overwrite: bool) -> None:
-    from naibu.workflows.studies.calibration_example import write_calibration_example
+    from naibu.workflows.studies.calibration.example import write_calibration_example
 
     written = write_calibration_example(folder, seed=seed, overwrite=overwrite)
     wrote(*written)
@@ -140,7 +140,7 @@ def _write_example(folder: Path, seed: int, overwrite: bool) -> None:
 
 def _show(run: LatticeCalibration) -> None:
     """Print what was found, what the data do not determine, and warnings."""
-    from naibu.workflows.studies.calibration_page import held_intervals
+    from naibu.workflows.studies.calibration.page import held_intervals
 
     found = run.estimate
     rows = [

@@ -23,8 +23,8 @@ from .lattice_calibration.evolutionary import search_cma_es, search_genetic
 from .lattice_calibration.forward_model import Capture, PushedFace, Pushing
 from .lattice_calibration.gauss_newton import CalibrationProblem, calibrate_lattice
 from .lattice_calibration.report_indices import ReportIndices, indices
-from .lattice_calibration.study_problem import StudyProblem
-from .lattice_calibration.study_unknowns import StudyUnknowns, Trial
+from .lattice_calibration.studies.study_problem import StudyProblem
+from .lattice_calibration.studies.study_unknowns import StudyUnknowns, Trial
 from .lattice_calibration.unknowns import LatticeUnknowns
 from .material_testing.marker_strain import MarkerStrain, marker_strain, poisson_ratio_from_markers
 from .material_testing.uniaxial import CompressionTest, PoissonRatio, Specimen, SpecimenMean, compression_test, poisson_ratio, specimen_mean

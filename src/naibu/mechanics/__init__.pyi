@@ -47,7 +47,7 @@ from .lattices.model.lattice import (
     lattice_parameters,
     voxel_parameters,
 )
-from .lattices.model.octree import octree_lattice
+from .lattices.model.octrees.octree import octree_lattice
 from .lattices.model.state import ConstrainedNodes, LatticeState, Motion
 from .lattices.model.tetrahedral_springs import volumetric_lattice
 from .lattices.simulation.adjoint import ParameterGradient, RecordedPush, push_gradient, recorded_push
@@ -55,7 +55,7 @@ from .lattices.simulation.contact import ContactMotion, push, push_by_force
 from .lattices.simulation.loading_history import LatticeStudy, StudyBody, StudyFrame, StudyState, run_study
 from .linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from .linear_algebra.direct import direct_solver
-from .linear_algebra.multigrid import MultigridSolver, rigid_body_modes
+from .linear_algebra.multigrid.multigrid_solver import MultigridSolver, rigid_body_modes
 from .linear_algebra.protocols import Factorization, LinearSolver
 from .linear_algebra.solver_selection import choose_solver
 from .prescribed_motion import PrescribedMotion

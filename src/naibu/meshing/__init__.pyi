@@ -1,6 +1,6 @@
 from .cutting.forest_cut import ForestCut, cut_forest, forest_pieces
-from .cutting.surface import SurfaceCutter, cut_surface
-from .cutting.surface_result import Groove, SurfaceCut, groove
+from .cutting.surfaces.surface_cut import SurfaceCutter, cut_surface
+from .cutting.surfaces.surface_result import Groove, SurfaceCut, groove
 from .cutting.swept_blade import SweptBlade, blade_poses, swept_blade
 from .cutting.volume import VolumeCut, cut_volume
 from .element_conversion import split_hexahedra, to_quadratic, to_tetra

@@ -8,6 +8,7 @@ from .adaptive.lattice import AdaptiveLattice, SpringMaterial
 from .adaptive.linear_dynamics import LinearDynamics
 from .adaptive.spring_levels import level_spring
 from .adaptive.statics import AdaptiveSolution, StaticResult, hyperelastic_static, linear_static, pressed_by, solve_adaptively
+from .cuts.lattice_cut import LatticeCut, cut_engine, cut_lattice, cut_session
 from .frame import Frame
 from .haptics.force_limits import ForceLimits
 from .haptics.haptic_loop import DeviceChannel, DeviceForce, DevicePose, HapticHand
@@ -17,10 +18,9 @@ from .haptics.simulated_device import SimulatedDevice
 from .haptics.virtual_coupling import VirtualCoupling
 from .interactive_bodies import FiniteElementBody, InteractiveBody, LatticeBody
 from .interactive_simulation import InteractiveSimulation
-from .lattice_cut import LatticeCut, cut_engine, cut_lattice, cut_session
 from .real_time_loop import RealTimeLoop
-from .surface_opening import opened, opening
-from .surface_springs import CutSprings, SurfaceSprings, surface_springs
+from .surfaces.opening import opened, opening
+from .surfaces.springs import CutSprings, SurfaceSprings, surface_springs
 
 __all__ = [
     "AdaptiveBody",

@@ -30,8 +30,8 @@ from naibu.meshing.element_conversion import to_tetra
 from naibu.meshing.quality import mean_edge_length
 from naibu.meshing.refinement.forest import BisectionForest
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
-from naibu.simulation.cut_sides import caution_of_cuts, outward_normals, with_sides_of_cuts
-from naibu.simulation.lattice_cut import LatticeCut, cut_engine, cut_lattice
+from naibu.simulation.cuts.cut_sides import caution_of_cuts, outward_normals, with_sides_of_cuts
+from naibu.simulation.cuts.lattice_cut import LatticeCut, cut_engine, cut_lattice
 from naibu.simulation.tool_places import surface_samples
 
 NO_NODES: IntArray = np.zeros(0, dtype=np.int64)
@@ -254,7 +254,7 @@ class FiniteElementBody:
     lips_friction : float
         Coulomb's coefficient between the sides of the cuts to come.
     outward : ndarray, shape (n, 3), optional
-        Normals of the blades at the nodes on the sides of their cuts; see `naibu.simulation.cut_sides.outward_normals`.
+        Normals of the blades at the nodes on the sides of their cuts; see `naibu.simulation.cuts.cut_sides.outward_normals`.
     """
 
     engine: DynamicEngine

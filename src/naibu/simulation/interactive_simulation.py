@@ -22,11 +22,11 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_strain.sessions.divided_session import DividedSession
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
-from naibu.simulation.background_cut import BackgroundCut, cut_in_balance
+from naibu.simulation.cuts.background_cut import BackgroundCut, cut_in_balance
+from naibu.simulation.cuts.lattice_cut import LatticeCut
 from naibu.simulation.frame import Frame, KeptState
 from naibu.simulation.held_tool import HeldTool, outside_planes
 from naibu.simulation.interactive_bodies import NO_NODES, AnySession, FiniteElementBody, InteractiveBody
-from naibu.simulation.lattice_cut import LatticeCut
 from naibu.simulation.tool_places import FollowedHand, farthest_in_a_step, placed, towards, turning_towards, waiting_place
 
 FRAME_S = 1.0 / 60.0

@@ -38,7 +38,7 @@ class Pace:
     recording, replaying : bool
         Whether frames are being kept, or shown again.
     cut_stage : int
-        Number in `naibu.simulation.background_cut.CUT_STAGES` of what is being done for a cut; -1 where none is under way.
+        Number in `naibu.simulation.cuts.background_cut.CUT_STAGES` of what is being done for a cut; -1 where none is under way.
     """
 
     steps_per_s: float

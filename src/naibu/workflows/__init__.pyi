@@ -17,8 +17,8 @@ from .measurement.track_clouds import CloudRun, track_clouds
 from .measurement.track_sequence import SequenceRun, track_sequence_file
 from .predict import PredictionRun
 from .reproduce import ReproducedChapter, reproduce, reproduce_all
-from .studies.calibrate import LatticeCalibration, calibrate_study
-from .studies.calibration_example import write_calibration_example
+from .studies.calibration.calibrate import LatticeCalibration, calibrate_study
+from .studies.calibration.example import write_calibration_example
 from .studies.simulate import NamedStudy, named_studies
 from .studies.simulate_lattice import SimulationRun
 

@@ -16,7 +16,7 @@ from naibu.identification.from_fields.forward.sensitivities import FieldModel, L
 from naibu.identification.from_fields.mesh_error import changes_of_motions, changes_on_finer_mesh, refitted
 from naibu.identification.from_fields.surface.noise import CorrectedInformation, DrawnMotions
 from naibu.identification.from_fields.uncertainty import intervals
-from naibu.identification.from_fields.verdict import FEW_POINTS
+from naibu.identification.from_fields.verdicts.verdict import FEW_POINTS
 
 SOME, PAIRS = 300, 12
 

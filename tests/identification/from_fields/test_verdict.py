@@ -15,7 +15,7 @@ from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.mesh_error import TOO_COARSE
-from naibu.identification.from_fields.verdict import FEW_POINTS, told_points
+from naibu.identification.from_fields.verdicts.verdict import FEW_POINTS, told_points
 from naibu.identification.verdict import Explanation
 from naibu.meshing.surface import boundary_faces
 from naibu.validation.specimens.quadratic_body import QuadraticBody, Solved

@@ -9,7 +9,7 @@ import pytest
 
 from naibu.identification.from_fields.forward.sensitivities import logarithms
 from naibu.identification.from_fields.uncertainty import Uncertainty
-from naibu.identification.from_fields.verdict_within_cells import HalfSize, judged_within_cells, told_alike, with_limits
+from naibu.identification.from_fields.verdicts.within_cells import HalfSize, judged_within_cells, told_alike, with_limits
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 

@@ -19,8 +19,8 @@ from naibu.identification.lattice_calibration.captured.sensor_errors import ANY_
 from naibu.identification.lattice_calibration.gauss_newton import calibrate_lattice
 from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import diagnosed, sensor_errors_found
 from naibu.identification.lattice_calibration.intervals.unnoticed_drift import counted_drift, unnoticed_drift
-from naibu.identification.lattice_calibration.study_problem import StudyProblem
-from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.identification.lattice_calibration.studies.study_problem import StudyProblem
+from naibu.identification.lattice_calibration.studies.study_unknowns import StudyUnknowns
 from naibu.workflows.studies.lattice_study import prepared_study
 
 SPACING, DEPTH, ENDS, NOISE_MN = 10.0, 2.0, 0.5, 5.0

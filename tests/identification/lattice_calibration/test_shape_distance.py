@@ -13,7 +13,7 @@ from naibu.core.errors import InputError
 from naibu.identification.lattice_calibration.captured.shape_distance import closest_points, force_difference, shape_difference
 from naibu.mechanics.contact.triangle_tree import TriangleTree
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.mechanics.lattices.model.surface import surface_of
 
 Array = NDArray[np.float64]

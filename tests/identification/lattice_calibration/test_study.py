@@ -14,9 +14,9 @@ from naibu.core.progress import ProgressReport
 from naibu.identification.lattice_calibration.captured.recorded_forces import RecordedForces
 from naibu.identification.lattice_calibration.evaluation import evaluated
 from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD, calibrate_lattice, estimate_at
-from naibu.identification.lattice_calibration.study_model import StudyModel
-from naibu.identification.lattice_calibration.study_problem import StudyProblem
-from naibu.identification.lattice_calibration.study_unknowns import StudyUnknowns
+from naibu.identification.lattice_calibration.studies.study_model import StudyModel
+from naibu.identification.lattice_calibration.studies.study_problem import StudyProblem
+from naibu.identification.lattice_calibration.studies.study_unknowns import StudyUnknowns
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
 from naibu.mechanics.lattices.simulation.loading_history import LatticeStudy, run_study
 from naibu.workflows.studies.lattice_study import prepared_study

@@ -23,7 +23,7 @@ from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import cut_volume
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_faces
-from naibu.simulation.cut_sides import outward_normals, softer_behind_cuts
+from naibu.simulation.cuts.cut_sides import outward_normals, softer_behind_cuts
 from naibu.simulation.interactive_bodies import FiniteElementBody
 
 SIZE = 20.0

@@ -19,7 +19,7 @@ from naibu.mechanics.finite_strain.newton import Newton
 from naibu.mechanics.finite_strain.problem import SolverSettings
 from naibu.mechanics.finite_strain.statics import AHEAD, solve
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
-from naibu.mechanics.linear_algebra.multigrid import MultigridSolver
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import MultigridSolver
 from naibu.meshing.element_conversion import to_quadratic, to_tetra
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_nodes, faces_towards, side_nodes

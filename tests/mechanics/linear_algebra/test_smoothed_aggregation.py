@@ -13,13 +13,13 @@ from hypothesis import strategies as st
 
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
-from naibu.mechanics.linear_algebra import _aggregation_kernels as aggregation
 from naibu.mechanics.linear_algebra import row_chunks
-from naibu.mechanics.linear_algebra import smoothed_aggregation as module
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.iterative import conjugate_gradients
-from naibu.mechanics.linear_algebra.multigrid import MultigridSolver, rigid_body_modes
-from naibu.mechanics.linear_algebra.smoothed_aggregation import SmoothedAggregation
+from naibu.mechanics.linear_algebra.multigrid import _aggregation_kernels as aggregation
+from naibu.mechanics.linear_algebra.multigrid import smoothed_aggregation as module
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import MultigridSolver, rigid_body_modes
+from naibu.mechanics.linear_algebra.multigrid.smoothed_aggregation import SmoothedAggregation
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.meshing.primitives import box
 

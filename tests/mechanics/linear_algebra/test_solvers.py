@@ -16,7 +16,7 @@ from naibu.mechanics.linear_algebra import direct, recycled_factors, solver_sele
 from naibu.mechanics.linear_algebra.block_matrix import with_dirichlet_rows
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, direct_solver, pardiso_library
 from naibu.mechanics.linear_algebra.iterative import RecycledCholesky
-from naibu.mechanics.linear_algebra.multigrid import MultigridSolver, rigid_body_modes
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import MultigridSolver, rigid_body_modes
 from naibu.mechanics.linear_algebra.recycled_factors import RecycledFactors, gmres
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
 from naibu.meshing.surface import side_nodes

@@ -22,7 +22,7 @@ from naibu.mechanics.finite_elements.linear_simplices import (
 )
 from naibu.mechanics.linear_algebra import direct, recycled_factors, solver_selection
 from naibu.mechanics.linear_algebra.direct import pardiso_library
-from naibu.mechanics.linear_algebra.multigrid import MultigridSolver
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import MultigridSolver
 from naibu.mechanics.linear_algebra.solver_selection import SolverName
 from naibu.mechanics.small_strain.linear_elasticity import LinearBody
 from naibu.meshing.primitives import box

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from naibu.meshing.cutting.surface_input import linked_surface
+from naibu.meshing.cutting.surfaces.surface_input import linked_surface
 from naibu.validation import hand_surface
 from naibu.validation.specimens.hand import level_surface
 

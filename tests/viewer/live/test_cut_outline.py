@@ -10,7 +10,7 @@ from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.meshing.cutting.volume import cut_volume
 from naibu.meshing.primitives import box
 from naibu.meshing.surface import boundary_faces
-from naibu.simulation.lattice_cut import cut_lattice
+from naibu.simulation.cuts.lattice_cut import cut_lattice
 from naibu.viewer.live.cut_outline import cut_outline, sides_of_cuts
 
 

@@ -12,7 +12,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.io.images import read_volume, write_volume
 from naibu.mechanics.lattices.model.elastic_springs import elastic_stiffness
-from naibu.workflows.studies.calibrate import calibrate_study
+from naibu.workflows.studies.calibration.calibrate import calibrate_study
 from naibu.workflows.studies.lattice_study import prepared_study
 
 STUDY = """

@@ -17,7 +17,7 @@ from naibu.io.images import write_volume
 from naibu.io.study_schemas.lattice_study_schema import load_study
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import classic_lattice
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.mechanics.lattices.model.surface import surface_of
 from naibu.mechanics.lattices.model.voxels import voxel_mask
 from naibu.validation.specimens.lattice_twin import CUBE_PUSHING, FIRST, SECOND, dough_lattice, dough_parameters

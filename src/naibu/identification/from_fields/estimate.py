@@ -64,9 +64,9 @@ from naibu.identification.from_fields.regions.segmentation import (
     weight_of_borders,
 )
 from naibu.identification.from_fields.uncertainty import resolution, resolution_report
-from naibu.identification.from_fields.verdict_within_cells import told_alike
+from naibu.identification.from_fields.verdicts.within_cells import told_alike
 from naibu.identification.load_case import require_load_cases
-from naibu.mechanics.linear_algebra.multigrid import rigid_body_modes
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import rigid_body_modes
 
 FEW = 12  # zones up to which no penalty is needed by default
 START_POISSON_RATIO = 0.4

@@ -18,7 +18,7 @@ from naibu.identification.from_fields.inversion.regularization_weight import Wei
 from naibu.identification.from_fields.regions.borders import Borders
 from naibu.identification.from_fields.regions.segmentation import Segmentation
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals
-from naibu.identification.from_fields.verdict_within_cells import DETERMINED, ROUGHLY
+from naibu.identification.from_fields.verdicts.within_cells import DETERMINED, ROUGHLY
 from naibu.identification.verdict import Verdict
 
 

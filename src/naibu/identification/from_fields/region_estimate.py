@@ -37,13 +37,13 @@ from naibu.identification.from_fields.mesh_error import (
 )
 from naibu.identification.from_fields.regions.border_refinement import CorrectedRegions, RefinedRegions
 from naibu.identification.from_fields.size_correction import SizeCorrection, without_size_of_elements
-from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.surface.bias import LEFT, without_bias
 from naibu.identification.from_fields.surface.noise import SurfaceNoise
 from naibu.identification.from_fields.surface.skewness import distances_of_bounds
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals
-from naibu.identification.from_fields.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
-from naibu.identification.from_fields.verdict_within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
+from naibu.identification.from_fields.verdicts.statement import statement
+from naibu.identification.from_fields.verdicts.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
+from naibu.identification.from_fields.verdicts.within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
 from naibu.identification.verdict import Verdict
 
 

@@ -11,7 +11,7 @@ from naibu.core.arrays import BoolArray, FloatArray, require_shape
 from naibu.core.errors import ConvergenceError
 from naibu.core.optional_packages import optional_package
 from naibu.mechanics.linear_algebra.iterative import ApproximateFactorization
-from naibu.mechanics.linear_algebra.multigrid import rigid_body_modes
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import rigid_body_modes
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
 

@@ -30,7 +30,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
 from naibu.mechanics.linear_algebra.direct import PardisoSolver, SuperLUSolver, pardiso_library
 from naibu.mechanics.linear_algebra.iterative import RecycledCholesky
-from naibu.mechanics.linear_algebra.multigrid import MultigridSolver
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import MultigridSolver
 from naibu.mechanics.linear_algebra.petsc import PetscSolver
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.recycled_factors import RecycledFactors

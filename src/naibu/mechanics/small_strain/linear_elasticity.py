@@ -15,7 +15,7 @@ from naibu.core.mesh import Mesh
 from naibu.mechanics.finite_elements.boundary_conditions import PrescribedDisplacement
 from naibu.mechanics.finite_elements.linear_simplices import Simplices, elastic_forces, per_cell, simplices
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
-from naibu.mechanics.linear_algebra.multigrid import rigid_body_modes
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import rigid_body_modes
 from naibu.mechanics.linear_algebra.protocols import Factorization
 from naibu.mechanics.linear_algebra.solver_selection import SolverName, choose_solver
 

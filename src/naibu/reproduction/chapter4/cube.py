@@ -13,7 +13,7 @@ from naibu.identification.lattice_calibration.gauss_newton import CalibrationPro
 from naibu.identification.lattice_calibration.report_indices import ReportIndices, indices_of
 from naibu.identification.lattice_calibration.unknowns import LatticeUnknowns
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.reproduction.chapter4.lattice_figures import FinalShape, final_shapes
 from naibu.reproduction.chapter4.patterns import START, with_interval_factor
 from naibu.reproduction.printed_tables import printed_table

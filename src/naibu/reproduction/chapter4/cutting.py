@@ -10,11 +10,11 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from naibu.core.arrays import FloatArray, IntArray
-from naibu.meshing.cutting.surface import SurfaceCutter, cut_surface
-from naibu.meshing.cutting.surface_result import Groove, SurfaceCut, groove
+from naibu.meshing.cutting.surfaces.surface_cut import SurfaceCutter, cut_surface
+from naibu.meshing.cutting.surfaces.surface_result import Groove, SurfaceCut, groove
 from naibu.reproduction.chapter4 import cutting_figures as figures
-from naibu.simulation.surface_opening import opening
-from naibu.simulation.surface_springs import CutSprings
+from naibu.simulation.surfaces.opening import opening
+from naibu.simulation.surfaces.springs import CutSprings
 from naibu.validation.specimens.hand import hand_surface
 from naibu.viewer.chapters.chapter import Chapter, Figure, Section
 from naibu.viewer.tables import Cell, Table

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
-from naibu.meshing.cutting.surface_result import Groove, SurfaceCut
+from naibu.meshing.cutting.surfaces.surface_result import Groove, SurfaceCut
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Canvas

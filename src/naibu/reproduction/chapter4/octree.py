@@ -9,7 +9,7 @@ import numpy as np
 
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.reproduction.printed_tables import printed_table
 from naibu.viewer.chapters.chapter import Chapter, Section
 from naibu.viewer.tables import Cell, Table

@@ -26,7 +26,7 @@ from naibu.mechanics.linear_algebra.recycled_factors import NEWTON_TOLERANCE, Re
 from naibu.mechanics.linear_algebra.solver_selection import choose_solver
 from naibu.simulation.adaptive.body import BodyState
 from naibu.simulation.adaptive.body_contact import BodyContact
-from naibu.simulation.cut_sides import with_sides_of_cuts
+from naibu.simulation.cuts.cut_sides import with_sides_of_cuts
 
 _MAX_NEWTON = 15
 _SUBDIVISIONS = 5  # of a step in contact that does not converge: halves, quarters, ...

@@ -31,7 +31,7 @@ from naibu.meshing.surface import boundary_faces
 from naibu.simulation.adaptive.conditions import Conditions, Selection
 from naibu.simulation.adaptive.error_estimator import recovery_indicators
 from naibu.simulation.adaptive.force_error import first_piola, path_force_errors
-from naibu.simulation.cut_sides import with_sides_of_cuts
+from naibu.simulation.cuts.cut_sides import with_sides_of_cuts
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -21,7 +21,7 @@ from naibu.identification.from_fields.forward.representation_error import with_n
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.mesh_error import one_cell_thick
-from naibu.identification.from_fields.verdict import LEAST_POINTS
+from naibu.identification.from_fields.verdicts.verdict import LEAST_POINTS
 from naibu.workflows.fields.block_mesh import CELLS, ends_within, lost_parts, misplaced, moved_borders, region_in, regions_of
 from naibu.workflows.fields.border_fitting import fitted_to_borders
 from naibu.workflows.fields.contradicted_measurements import without_contradicted

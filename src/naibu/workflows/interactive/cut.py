@@ -27,9 +27,9 @@ from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.meshing.cutting.swept_blade import SweptBlade, swept_blade
 from naibu.meshing.cutting.volume import VolumeCut
 from naibu.meshing.quality import mean_edge_length, signed_volumes
-from naibu.simulation.cut_sides import caution_of_cuts
+from naibu.simulation.cuts.cut_sides import caution_of_cuts
+from naibu.simulation.cuts.lattice_cut import LatticeCut
 from naibu.simulation.interactive_bodies import AnySession, FiniteElementBody, InteractiveBody, LatticeBody
-from naibu.simulation.lattice_cut import LatticeCut
 from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, motion_html
 from naibu.viewer.notebook import WrittenResult

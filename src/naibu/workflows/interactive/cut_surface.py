@@ -22,9 +22,9 @@ from naibu.io.files.provenance import sha256
 from naibu.io.meshes import SURFACE_READERS, Surface, read_surface
 from naibu.io.tables.blade_table import read_tip_path
 from naibu.io.vtk_files import write_vtkhdf_series, write_vtu
-from naibu.meshing.cutting.surface import cut_surface as cut_along
-from naibu.meshing.cutting.surface_result import SurfaceCut, groove, triangle_areas
-from naibu.simulation.surface_opening import LARGEST_TENSION, opening
+from naibu.meshing.cutting.surfaces.surface_cut import cut_surface as cut_along
+from naibu.meshing.cutting.surfaces.surface_result import SurfaceCut, groove, triangle_areas
+from naibu.simulation.surfaces.opening import LARGEST_TENSION, opening
 from naibu.viewer.cards import Card
 from naibu.viewer.motion_page import ColourField, MotionPage, RigidShape, motion_html
 from naibu.viewer.notebook import WrittenResult

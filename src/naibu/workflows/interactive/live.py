@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from naibu.core.errors import InputError
 from naibu.mechanics.contact.rigid_indenters import RigidIndenter
-from naibu.simulation.background_cut import CUT_STAGES
+from naibu.simulation.cuts.background_cut import CUT_STAGES
 from naibu.simulation.frame import Frame
 from naibu.simulation.haptics.haptic_loop import LONGEST_STEP_S, HapticHand
 from naibu.simulation.haptics.haptic_thread import HapticThread

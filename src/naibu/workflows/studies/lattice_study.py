@@ -28,7 +28,7 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter, box_indenter,
 from naibu.mechanics.lattices.model.contact_state import TOUCH_MM, check_outside
 from naibu.mechanics.lattices.model.hexahedra import lattice_mesh
 from naibu.mechanics.lattices.model.lattice import CLASSES, Lattice, box_mask, classic_lattice
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.mechanics.lattices.model.voxels import cropped_mask, voxel_mask
 from naibu.mechanics.lattices.simulation.loading_history import Drive, LatticeStudy, StudyBody, check_study
 from naibu.mechanics.lattices.simulation.tied_bodies import FacePoints

@@ -11,8 +11,8 @@ import scipy.sparse as sp
 from scipy.optimize import nnls
 
 from naibu.core.arrays import FloatArray
-from naibu.mechanics.finite_strain.sessions.condensed_contact import UNAIDED, CondensedContact
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
+from naibu.mechanics.finite_strain.sessions.tangents.condensed_contact import UNAIDED, CondensedContact
+from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
 from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse, UpdatedFactors

@@ -7,7 +7,7 @@ import pytest
 
 from naibu.core.arrays import FloatArray
 from naibu.mechanics import Assembler, RealTimeEngine, body_force, elements, material, plane_indenter
-from naibu.mechanics.finite_strain.sessions.contact_beside_tangent import ContactBesideTangent
+from naibu.mechanics.finite_strain.sessions.tangents.contact_beside_tangent import ContactBesideTangent
 from naibu.meshing import boundary_faces, box
 
 SIZE = 40.0  # mm

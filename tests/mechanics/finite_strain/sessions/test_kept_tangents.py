@@ -8,10 +8,10 @@ import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
 from naibu.mechanics import Assembler, IndenterVelocity, RealTimeEngine, body_force, elements, material, plane_indenter
-from naibu.mechanics.finite_strain.sessions import kept_tangents
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
-from naibu.mechanics.finite_strain.sessions.kept_tangents import KeptTangents
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
+from naibu.mechanics.finite_strain.sessions.tangents import kept_tangents
+from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
+from naibu.mechanics.finite_strain.sessions.tangents.kept_tangents import KeptTangents
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 from naibu.meshing import boundary_faces, box

@@ -15,7 +15,7 @@ from naibu.mechanics.lattices.cpu.implicit import coarse_space
 from naibu.mechanics.lattices.cpu.implicit._coarse_kernels import _from_nodes, _to_nodes, add_contacts, gather, turn_with
 from naibu.mechanics.lattices.cpu.implicit._pcg_kernels import multiply
 from naibu.mechanics.lattices.model.lattice import Lattice, LatticeParameters, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 from naibu.mechanics.lattices.model.tetrahedral_springs import volumetric_lattice
 from naibu.meshing.primitives import box

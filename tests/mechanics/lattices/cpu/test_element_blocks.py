@@ -9,7 +9,7 @@ import pytest
 
 from naibu.mechanics.lattices.cpu.element_blocks import Blocks
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 
 
 def bodies():

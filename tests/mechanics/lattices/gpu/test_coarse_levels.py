@@ -12,7 +12,7 @@ from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.gpu import coarse_levels
 from naibu.mechanics.lattices.gpu.engine import WarpLatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 
 STIFF = (10.0, 5.0, 10.0)

@@ -13,7 +13,7 @@ from naibu.mechanics.contact.rigid_indenters import plane_indenter
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.gpu.engine import WarpLatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.octree import octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes, LatticeState
 
 METHODS = ("implicit", "euler", "symplectic_euler")

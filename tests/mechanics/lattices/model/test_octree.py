@@ -9,7 +9,7 @@ from naibu.core.errors import InputError
 from naibu.datasets import paper_tables
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.octree import octree_cubes, octree_lattice
+from naibu.mechanics.lattices.model.octrees.octree import octree_cubes, octree_lattice
 from naibu.mechanics.lattices.model.state import LatticeState
 
 TABLES = {table["id"]: table["rows"] for table in paper_tables()["tables"]}

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from naibu.core.errors import InputError
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.model.lattice import Lattice, box_mask, classic_lattice, lattice_parameters
-from naibu.mechanics.lattices.model.octree import octree_lattice
-from naibu.mechanics.lattices.model.octree_compliance_correction import EquilibriumPolynomials, lengthening
+from naibu.mechanics.lattices.model.octrees.compliance_correction import EquilibriumPolynomials, lengthening
+from naibu.mechanics.lattices.model.octrees.octree import octree_lattice
 from naibu.mechanics.lattices.model.state import ConstrainedNodes
 
 EQUAL = np.ones(3)

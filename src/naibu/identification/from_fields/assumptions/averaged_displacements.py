@@ -23,7 +23,7 @@ from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
-from naibu.identification.from_fields.verdict import WITHIN_NOISE
+from naibu.identification.from_fields.verdicts.verdict import WITHIN_NOISE
 from naibu.identification.neighbours import neighbours
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.point_location import locate, operator_of

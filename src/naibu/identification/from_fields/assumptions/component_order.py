@@ -22,7 +22,7 @@ from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones, is_surface_sought
 from naibu.identification.from_fields.forward.sensitivities import FieldModel
-from naibu.mechanics.linear_algebra.multigrid import rigid_body_modes
+from naibu.mechanics.linear_algebra.multigrid.multigrid_solver import rigid_body_modes
 
 POISSON_RATIOS = (0.45, 0.49, 0.3, 0.498, 0.0)  # of the homogeneous body, the most usual first
 LEAST_SHARE = 0.15  # of the deformation, by root mean square, that errors of elements and of small strain may leave as well

@@ -22,7 +22,7 @@ from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point, moduli_of
 from naibu.identification.from_fields.forward.shaped_law import N_SHAPES, ShapedLaw
-from naibu.identification.from_fields.verdict import inflation
+from naibu.identification.from_fields.verdicts.verdict import inflation
 
 SHAPE_SD = (0.5, 1.0, 1.0, 1.0)  # of c01, c20, c30 as in identification from markers; of the isochoric part, which is none or all
 ELEMENTS_SD = 1.0  # of the error of elements in the residuals, over what half the size changes, which is expected

@@ -33,10 +33,10 @@ from naibu.identification.from_fields.forward.sensitivities import young_and_poi
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.inversion.regularization import cell_volumes, inner_faces
 from naibu.identification.from_fields.mesh_error import TOO_COARSE
-from naibu.identification.from_fields.statement import statement
 from naibu.identification.from_fields.uncertainty import LawPart, Uncertainty, intervals, young_and_poisson_slopes
-from naibu.identification.from_fields.verdict import FEW_POINTS, told_points
-from naibu.identification.from_fields.verdict_within_cells import told_alike, with_limits
+from naibu.identification.from_fields.verdicts.statement import statement
+from naibu.identification.from_fields.verdicts.verdict import FEW_POINTS, told_points
+from naibu.identification.from_fields.verdicts.within_cells import told_alike, with_limits
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 ONE_MATERIAL = (

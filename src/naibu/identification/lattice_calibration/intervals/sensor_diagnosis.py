@@ -15,7 +15,7 @@ from naibu.identification.lattice_calibration.forward_model import Reproduced
 from naibu.identification.lattice_calibration.gauss_newton import PRIOR_SD
 from naibu.identification.lattice_calibration.intervals.model_errors import MISFIT
 from naibu.identification.lattice_calibration.least_squares import about, unsettled_covariance
-from naibu.identification.lattice_calibration.study_problem import StudyProblem
+from naibu.identification.lattice_calibration.studies.study_problem import StudyProblem
 
 CANDIDATES = tuple(
     SensorErrors(bool(offset), bool(drift), bool(delay), np.inf)

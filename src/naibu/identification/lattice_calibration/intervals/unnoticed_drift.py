@@ -9,7 +9,7 @@ import numpy as np
 from naibu.identification.lattice_calibration.estimate import LatticeEstimate
 from naibu.identification.lattice_calibration.forward_model import Reproduced
 from naibu.identification.lattice_calibration.intervals.sensor_diagnosis import at_estimate, fitted
-from naibu.identification.lattice_calibration.study_problem import StudyProblem
+from naibu.identification.lattice_calibration.studies.study_problem import StudyProblem
 
 QUANTILE = 1.96
 

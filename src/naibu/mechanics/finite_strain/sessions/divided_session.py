@@ -21,8 +21,8 @@ from naibu.mechanics.contact.indenter_motion import IndenterMotion
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.contact.session_protocol import StepForces
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession, DynamicState
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.newton_session import NewtonSession
+from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.trial_displacement import PASSABLE, Trial
 
 PARTS = (8, 16)  # in which a step is taken whose balance is not found

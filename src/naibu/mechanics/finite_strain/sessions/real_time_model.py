@@ -15,8 +15,8 @@ from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import LipMultipliers, lips_of, with_multipliers, with_secant
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, SolverPool
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import lips_about_to_change, pairs_along_normals
+from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent, SolverPool
+from naibu.mechanics.finite_strain.sessions.tangents.lips_beside_tangent import lips_about_to_change, pairs_along_normals
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors

@@ -23,14 +23,14 @@ from naibu.mechanics.contact.rigid_indenters import RigidIndenter
 from naibu.mechanics.finite_elements.pressure_elements import PressureElements
 from naibu.mechanics.finite_strain.lip_assembly import lips_of
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
-from naibu.mechanics.finite_strain.sessions.condensed_contact import CHANGES, UNAIDED, CondensedContact
-from naibu.mechanics.finite_strain.sessions.contact_beside_tangent import ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.divided_session import DividedSession
 from naibu.mechanics.finite_strain.sessions.dynamic_session import PENETRATION, DynamicSession, DynamicState
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
-from naibu.mechanics.finite_strain.sessions.lips_beside_tangent import ApproachingLips, changing_lips, in_threes, motion_in_threes
 from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel
 from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
+from naibu.mechanics.finite_strain.sessions.tangents.condensed_contact import CHANGES, UNAIDED, CondensedContact
+from naibu.mechanics.finite_strain.sessions.tangents.contact_beside_tangent import ContactBesideTangent
+from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
+from naibu.mechanics.finite_strain.sessions.tangents.lips_beside_tangent import ApproachingLips, changing_lips, in_threes, motion_in_threes
 from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, Trial
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 

@@ -13,11 +13,11 @@ from naibu.core.arrays import FloatArray, Int32Array, IntArray
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_strain.lip_assembly import LipMultipliers
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact, local_positions
-from naibu.mechanics.finite_strain.sessions.condensed_contact import CondensedContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
-from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent, TangentThread
-from naibu.mechanics.finite_strain.sessions.kept_tangents import KeptTangents
 from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel, nodes_ahead, tangent_at
+from naibu.mechanics.finite_strain.sessions.tangents.condensed_contact import CondensedContact
+from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent, TangentThread
+from naibu.mechanics.finite_strain.sessions.tangents.kept_tangents import KeptTangents
 from naibu.mechanics.finite_strain.sessions.trial_displacement import PASSABLE
 
 PERIOD = 10  # steps after which a tangent is renewed without a thread

@@ -47,7 +47,7 @@ class Lattice:
         Edge of the finest voxels, mm; the mean length of elements where there are none.
     scale : ndarray, shape (m,)
         How many times stiffer, and more viscous, than between the finest voxels an element is to be so that the solid answers as the
-        classic lattice does: see `naibu.mechanics.lattices.model.octree.octree_lattice`. One in classic lattices, read-only.
+        classic lattice does: see `naibu.mechanics.lattices.model.octrees.octree.octree_lattice`. One in classic lattices, read-only.
     cells : ndarray, shape (c, 8), int64, optional
         Nodes of the cubes in VTK's order of a hexahedron; None of lattices of any other shape.
     faces : ndarray, shape (f, 3) or (f, 4), int64, optional

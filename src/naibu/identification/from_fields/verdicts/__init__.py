@@ -1,0 +1,1 @@
+"""What identification from fields says of its result."""

@@ -1,0 +1,1 @@
+"""Calibration of a lattice study: its model, its unknowns, its problem."""

@@ -1,0 +1,1 @@
+"""Tangents that sessions keep, correct and condense."""

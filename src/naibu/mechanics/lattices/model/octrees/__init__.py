@@ -1,0 +1,1 @@
+"""Lattices of octrees, and what makes them respond as regular ones."""

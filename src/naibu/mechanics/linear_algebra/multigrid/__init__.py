@@ -1,0 +1,1 @@
+"""Multigrid: smoothed aggregation, its cycles, and the solver that uses them."""

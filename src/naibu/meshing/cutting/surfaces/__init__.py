@@ -1,0 +1,1 @@
+"""Cuts of triangulated surfaces along the path of a tool."""
