@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import io
 import warnings
+from pathlib import Path
+from threading import Thread
 
 import pytest
 from rich.console import Console
 
 from naibu.cli.shell import console
+from naibu.cli.shell.run_record import recorded_run
 from naibu.core.errors import NaibuWarning
 from naibu.core.progress import ProgressReport, report_progress
 
@@ -47,6 +50,20 @@ def test_a_pipe_gets_a_line_for_each_stage_and_then_at_intervals(stream: io.Stri
         "identify [1], 5, objective 999, 10 s",
         "writing, 1 of 4, 25 %, 10 s",
     ]
+
+
+def test_progress_of_other_threads_obeys_quiet_and_is_logged(stream: io.StringIO, tmp_path: Path) -> None:
+    clock = Clock()
+    with recorded_run(["demo"]) as run:
+        run.quiet = True
+        run.log_to(tmp_path / "run.log")
+        with console.progress_display(clock) as progress:
+            clock.now += 2.0
+            thread = Thread(target=report_progress, args=(progress, "without the first experiment"))
+            thread.start()
+            thread.join()
+    assert not stream.getvalue()
+    assert "without the first experiment" in (tmp_path / "run.log").read_text(encoding="utf-8")
 
 
 def test_a_terminal_gets_a_bar_for_each_stage(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -88,6 +88,7 @@ class _PlainProgress:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._began = clock()
+        self._run = current_run()  # a computation may report from threads of its own, which know of no run
         self._stage, self._said = "", -INTERVAL_S
         self._left = TimeLeft()
 
@@ -99,8 +100,8 @@ class _PlainProgress:
             return
         self._stage, self._said = report.stage, now
         line = ", ".join(part for part in (report.stage, _share(report), _objective(report), f"{now:.0f} s", left) if part)
-        current_run().logged(line)
-        if not current_run().quiet:
+        self._run.logged(line)
+        if not self._run.quiet:
             errors.print(line, soft_wrap=True, highlight=False, markup=False)
 
 

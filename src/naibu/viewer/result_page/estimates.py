@@ -77,7 +77,7 @@ def _card(row: ParameterRow) -> Card:
 
 
 def _plain(value: float, width: float) -> str:
-    text = _to_width(value, width)
+    text = text_to_width(value, width)
     return f"{value:.3g}" if "<" in text else text
 
 
@@ -95,16 +95,22 @@ def _unit_row(unit: str, scale: _Scale) -> str:
 
 def _parameter_row(row: ParameterRow, scale: _Scale) -> str:
     width = row.upper - row.lower
-    low, high = (_to_width(v, width) if math.isfinite(v) else "?" for v in (row.lower, row.upper))
+    low, high = (text_to_width(v, width) if math.isfinite(v) else "?" for v in (row.lower, row.upper))
     unit = f" {escape(row.unit)}" if row.unit else ""
-    value = f"<strong>{_to_width(row.estimate, width)}</strong> [{low}, {high}]{unit}"
+    value = f"<strong>{text_to_width(row.estimate, width)}</strong> [{low}, {high}]{unit}"
     name = escape(row.label) if row.label == row.name else f"{escape(row.label)} <code>{escape(row.name)}</code>"
     svg = f'<svg width="100%" height="20" aria-hidden="true">{_interval(row, scale)}</svg>'
     return f'<tr><th scope="row">{name}</th><td>{value}</td><td class="plot">{svg}</td><td>{escape(row.remarks)}</td></tr>'
 
 
-def _to_width(value: float, width: float) -> str:
-    """Return a value with the decimals of two significant digits of its interval's width."""
+def text_to_width(value: float, width: float) -> str:
+    """Return a value with the decimals of two significant digits of its interval's width.
+
+    Parameters
+    ----------
+    value, width : float
+        Value, and width of its interval, in one unit.
+    """
     if not (math.isfinite(value) and math.isfinite(width) and width > 0) or not 1e-3 <= abs(value) < 1e5:
         return cell_text(value)
     digits = min(6, max(0, 1 - math.floor(math.log10(width))))

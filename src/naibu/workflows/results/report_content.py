@@ -23,6 +23,7 @@ from naibu.identification.prediction.prediction import Prediction
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.meshing.surface import boundary_faces, triangles_of_faces
+from naibu.viewer.result_page.estimates import text_to_width
 from naibu.viewer.result_page.payload import Box, Correlation, ParameterRow, Report, ResidualSet, Scene, Step, VerdictNote
 from naibu.viewer.tables import Cell, Table
 
@@ -262,7 +263,7 @@ def _by_law(p: Parameter, model: CalibratedModel) -> str:
         return ""
     factor, _ = model.shown(p)
     low, high = (factor * bound for bound in model.interval(p.name, law_exact=True))
-    return f"{low:.4g} to {high:.4g} if the law is exactly {model.settings.law}"
+    return f"{text_to_width(low, high - low)} to {text_to_width(high, high - low)} if the law is exactly {model.settings.law}"
 
 
 def build_report(
