@@ -285,6 +285,21 @@ def test_known_values_and_what_is_wrong_with_them() -> None:
             parse_known_zones(known, names)
 
 
+def test_a_rigid_zone_neither_has_other_values_nor_dwarfs_the_colours_of_soft_ones(folder: Path) -> None:
+    labels = read_volume(folder / "labels.mha")
+    values = labels.values.copy()
+    values[12:18, 7:17, 7:17] = 3
+    write_volume(folder / "cored.mha", labels.with_values(values))
+    options = {"zones": folder / "cored.mha", "known": ["label 2=10 kPa, 0.4", "label 3=rigid"], "element_size_mm": 10.0}
+    run = identify_fields(folder / "field.h5", law="linear", out=folder / "out", **options)  # type: ignore[arg-type]
+    others = [str(row[0]) for row in table_of_assumptions(run).rows]
+    assert any("'label 2'" in one for one in others) and not any("'label 3'" in one for one in others)
+    (top,) = re.findall(r"\"Young's modulus, kPa\",\"low\":[-\d.e]+,\"high\":([\d.e]+)", run.page_html())
+    assert float(top) < 100.0
+    modulus = read_volume(folder / "out" / "young_modulus.mha", missing=True)
+    assert modulus.values[values == 3].max() == pytest.approx(3e5)
+
+
 def test_files_that_do_not_belong_together_are_told(folder: Path) -> None:
     far = DisplacementField.from_arrays(np.random.default_rng(0).random((100, 3)), np.ones((100, 3)), sd_mm=0.1)
     write_field(folder / "far.h5", far)

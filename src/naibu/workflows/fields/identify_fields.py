@@ -383,9 +383,10 @@ def _volumes(result: FieldIdentification) -> tuple[FloatArray, FloatArray, Float
 
 
 def _maps(result: FieldIdentification) -> list[tuple[str, FloatArray]]:
-    """Return what a page and a figure show, with names; NaN outside and where nothing is known."""
+    """Return what a page and a figure show, with names; NaN outside, where nothing is known, and in rigid zones, which dwarf the others."""
     young, sd, poisson = _volumes(result)
-    outside = np.where(result.cell_of_voxel >= 0, 0.0, np.nan)
+    there = result.cell_of_voxel
+    outside = np.where((there >= 0) & ~result.estimate.zones.in_rigid_region[there], 0.0, np.nan)
     return [
         (f"Young's modulus, {result.unit}", young + outside),
         (f"standard deviation of Young's modulus, {result.unit}", np.where(sd > 0.0, sd, np.nan) + outside),

@@ -31,6 +31,11 @@ class KnownZones:
         return tuple(self.doubts)
 
     @property
+    def rigid(self) -> tuple[str, ...]:
+        """Names of the zones that are called rigid."""
+        return tuple(name for name in self.values if name not in self.doubts)
+
+    @property
     def bounds(self) -> Bounds:
         """Bounds of shear moduli, beyond which a zone cannot be told from one that is rigid, or empty."""
         known = [young for young, _ in self.values.values()] or [1.0]

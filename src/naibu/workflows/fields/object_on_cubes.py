@@ -184,7 +184,7 @@ class ObjectOnCubes:
         coarser: FieldEstimate | None = None,
     ) -> FieldEstimate:
         """Return the moduli of zones that are not stated (see `identify_field`), from those on coarser cubes where these are known."""
-        given = Zones.of(self.mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative)
+        given = Zones.of(self.mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative, rigid=stated.rigid)
         borders = moved_borders(self.mesh, self.scanned.inside, self.scanned.labels)
         begin: tuple[FloatArray, FloatArray] | None = None
         other: FloatArray | None = None
@@ -205,7 +205,7 @@ class ObjectOnCubes:
         """Return lambda and mu (count,), kPa, of a homogeneous body on about `CELLS` cubes to start from, and what it leaves, in words."""
         try:
             few = self.scanned.on_cubes(self.scanned.edge_mm(CELLS), (), exactly=True, each_cell=True)
-            zones = Zones.of(few.mesh, known=stated.values, known_sd=stated.doubts, relative=stated.relative)
+            zones = Zones.of(few.mesh, known=stated.values, known_sd=stated.doubts, relative=stated.relative, rigid=stated.rigid)
             lame, shear, told = homogeneous_moduli(few.mesh, few.load_cases, zones, law=law, bounds=bounds, progress=progress)
         except (ConvergenceError, InputError):  # of zones that so large cubes do not show
             return None, ()

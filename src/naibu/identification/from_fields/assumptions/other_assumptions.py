@@ -157,7 +157,9 @@ def other_poisson_ratio(poisson: float) -> float:
 
 
 def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
-    """Return text, Young's modulus, Poisson's ratio and distance in standard deviations of other moduli of a region."""
+    """Return text, Young's modulus, Poisson's ratio and distance in standard deviations of other moduli of a region; of a rigid one, none."""
+    if region.is_rigid:
+        return []
     young, poisson = region.young_modulus, region.poisson_ratio
     near = other_poisson_ratio(poisson)
     of_young = OTHER_YOUNG / region.young_modulus_sd if region.young_modulus_sd > 0.0 else 0.0

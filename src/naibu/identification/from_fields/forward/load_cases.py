@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,6 +89,8 @@ class KnownRegion:
         Standard deviation of Poisson's ratio.
     is_unit : bool
         Whether its modulus is not known, but the unit of the others.
+    is_rigid : bool
+        Whether its modulus stands for a rigid body, so that other values of it say nothing.
     """
 
     name: str
@@ -97,6 +99,7 @@ class KnownRegion:
     young_modulus_sd: float = 0.0
     poisson_ratio_sd: float = 0.0
     is_unit: bool = False
+    is_rigid: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,6 +136,7 @@ class Zones:
         each_cell: bool | Sequence[str] = False,
         known_sd: Mapping[str, tuple[float, float]] | None = None,
         relative: bool = False,
+        rigid: Collection[str] = (),
     ) -> Zones:
         """Make one zone of every region that is not known, or of every cell of it.
 
@@ -149,6 +153,8 @@ class Zones:
             the uncertainty of what is identified. Zero by default.
         relative : bool
             Whether Young's moduli of the known regions are not known, but the unit of the others.
+        rigid : collection of str
+            Known regions whose moduli stand for those of rigid bodies; no other values of these are tried.
 
         Raises
         ------
@@ -159,6 +165,8 @@ class Zones:
         for name in [*known, *doubt, *(each_cell if not isinstance(each_cell, bool) else ())]:
             if name not in mesh.region_names:
                 raise InputError(f"region {name!r} does not exist; the mesh has {', '.join(mesh.region_names)}")
+        if apart := [name for name in rigid if name not in known]:
+            raise InputError(f"rigid names {apart[0]!r}, whose moduli `known` does not state")
         of_cell = np.full(mesh.n_cells, KNOWN, dtype=np.int64)
         lame, shear = np.full(mesh.n_cells, np.nan), np.full(mesh.n_cells, np.nan)
         names: list[str] = []
@@ -169,7 +177,8 @@ class Zones:
             if region in known:
                 lame[cells], shear[cells] = lame_parameters(*known[region])
                 region_of_cell[cells] = len(regions)
-                regions.append(KnownRegion(region, *known[region], *doubt.get(region, (0.0, 0.0)), is_unit=relative))
+                sd = doubt.get(region, (0.0, 0.0))
+                regions.append(KnownRegion(region, *known[region], *sd, is_unit=relative, is_rigid=region in rigid))
             elif each_cell if isinstance(each_cell, bool) else region in each_cell:
                 of_cell[cells] = len(names) + np.arange(len(cells))
                 names += [f"{region}: cell {c}" for c in cells]
@@ -188,6 +197,14 @@ class Zones:
     def count(self) -> int:
         """Number of unknown zones."""
         return len(self.names)
+
+    @property
+    def in_rigid_region(self) -> BoolArray:
+        """Whether a cell (m,) lies in a known region that is called rigid."""
+        if self.region_of_cell is None:
+            return np.zeros(len(self.of_cell), dtype=bool)
+        rigid = np.array([*(region.is_rigid for region in self.known), False])
+        return rigid[self.region_of_cell]
 
     @property
     def unit(self) -> str:
