@@ -21,7 +21,6 @@ from naibu.core.progress import Progress, report_progress
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
-from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.identified.sides import SIDES
 from naibu.identification.from_fields.planning.planned_identification import planned_identification
@@ -198,7 +197,7 @@ def design(
     longer = sizes_of_voxels(inside, element_size_mm) if element_size_mm else ()
     volume = float(inside.values.sum() * np.prod(inside.spacing_mm))
     mesh, _ = block_mesh(inside, labels, names, element_size_mm or (volume / CELLS) ** (1.0 / 3.0))
-    model = Zones.of(mesh, known=stated.values, known_sd=stated.doubts)
+    model = stated.zones(mesh)
     young, poisson = np.array([sought[name] for name in model.names]).T
     truth = IdentifiedBody.stated(mesh, model, young, poisson, axes=inside.direction, law=law)
     loads = _loads(pushes, np.ptp(mesh.points, axis=0))

@@ -6,8 +6,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
 from naibu.core.units import kilopascals
-from naibu.identification.from_fields.forward.load_cases import POISSON_RATIO, POISSON_RATIO_SD
+from naibu.identification.from_fields.forward.load_cases import POISSON_RATIO, POISSON_RATIO_SD, Zones
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 
 RIGID = (
@@ -40,6 +41,11 @@ class KnownZones:
         """Bounds of shear moduli, beyond which a zone cannot be told from one that is rigid, or empty."""
         known = [young for young, _ in self.values.values()] or [1.0]
         return Bounds(shear_modulus=(min(known) / BEYOND_KNOWN, max(known) * BEYOND_KNOWN))
+
+    def zones(self, mesh: Mesh, *, each_cell: bool | Sequence[str] = False) -> Zones:
+        """Return the zones of a mesh that has these regions; see `Zones.of`."""
+        sd, rigid = self.doubts, self.rigid
+        return Zones.of(mesh, known=self.values, known_sd=sd, each_cell=each_cell, relative=self.relative, rigid=rigid)
 
     def without(self, names: Collection[str]) -> KnownZones:
         """Return what is known of other zones than these."""

@@ -16,7 +16,7 @@ from naibu.core.volume import Volume
 from naibu.identification.from_fields.estimate import homogeneous_moduli, identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import LawName
-from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.forward.representation_error import with_noise_of_neighbours, with_representation_error
 from naibu.identification.from_fields.forward.zones_within_cells import RegionAt
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
@@ -184,7 +184,7 @@ class ObjectOnCubes:
         coarser: FieldEstimate | None = None,
     ) -> FieldEstimate:
         """Return the moduli of zones that are not stated (see `identify_field`), from those on coarser cubes where these are known."""
-        given = Zones.of(self.mesh, known=stated.values, known_sd=stated.doubts, each_cell=each_cell, relative=stated.relative, rigid=stated.rigid)
+        given = stated.zones(self.mesh, each_cell=each_cell)
         borders = moved_borders(self.mesh, self.scanned.inside, self.scanned.labels)
         begin: tuple[FloatArray, FloatArray] | None = None
         other: FloatArray | None = None
@@ -205,7 +205,7 @@ class ObjectOnCubes:
         """Return lambda and mu (count,), kPa, of a homogeneous body on about `CELLS` cubes to start from, and what it leaves, in words."""
         try:
             few = self.scanned.on_cubes(self.scanned.edge_mm(CELLS), (), exactly=True, each_cell=True)
-            zones = Zones.of(few.mesh, known=stated.values, known_sd=stated.doubts, relative=stated.relative, rigid=stated.rigid)
+            zones = stated.zones(few.mesh)
             lame, shear, told = homogeneous_moduli(few.mesh, few.load_cases, zones, law=law, bounds=bounds, progress=progress)
         except (ConvergenceError, InputError):  # of zones that so large cubes do not show
             return None, ()

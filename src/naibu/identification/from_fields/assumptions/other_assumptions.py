@@ -157,7 +157,7 @@ def other_poisson_ratio(poisson: float) -> float:
 
 
 def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
-    """Return text, Young's modulus, Poisson's ratio and distance in standard deviations of other moduli of a region; of a rigid one, none."""
+    """Return text, Young's modulus, Poisson's ratio and distance in standard deviations of other moduli of a region that is not rigid."""
     if region.is_rigid:
         return []
     young, poisson = region.young_modulus, region.poisson_ratio
