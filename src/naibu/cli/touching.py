@@ -36,7 +36,7 @@ def live(
     lips_friction: float = 0.0,
     browser: bool = True,
 ) -> None:
-    """Touch a simulated body in the browser: push it, pull it, look inside and read the force.
+    """Touch a simulated body in the browser: push, pull and cut it, look inside and read the force.
 
     The page is served to this computer only; Ctrl-C ends it.
 
