@@ -327,6 +327,7 @@ def test_a_map_without_a_known_zone_is_relative_to_its_largest_region(folder: Pa
     other = below != below[largest]
     assert not ((young[other, 0] <= 1.0) & (young[other, 1] >= 1.0)).any()
     assert run.relative and run.unit == "multiples of the largest region" and "kPa" not in " ".join(run.notes)
+    assert ">1 × the largest region<" in run.page_html()
     assert "largest region" in (folder / "map" / "report.html").read_text() and run.body.unit == run.unit
     assert not [name for name in TEXTS if "kPa" in (folder / "map" / name).read_text()]
 

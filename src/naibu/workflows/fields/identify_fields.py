@@ -338,7 +338,8 @@ def _cards(result: FieldIdentification) -> list[Card]:
         return []
     how = _grades(found, found.uncertainty)
     rows = zip(found.zones.names[:MOST_CARDS], found.young_modulus, found.intervals()[0], how, strict=False)
-    return [_card(name, result.unit, e, low, high, word) for name, e, (low, high), word in rows]
+    unit = result.unit.replace("multiples of", "×")  # behind a number
+    return [_card(name, unit, e, low, high, word) for name, e, (low, high), word in rows]
 
 
 def _card(name: str, unit: str, young: float, low: float, high: float, how: str) -> Card:
