@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
 from naibu.mechanics import (
     Assembler,
     DynamicEngine,
@@ -23,6 +24,7 @@ from naibu.mechanics import (
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_strain.sessions import real_time_session
 from naibu.mechanics.finite_strain.sessions.divided_session import PARTS
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
 from naibu.mechanics.finite_strain.sessions.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
 from naibu.mechanics.finite_strain.sessions.trial_displacement import Trial
@@ -132,6 +134,29 @@ def test_iterations_whose_error_stays_end_soon_and_begin_nowhere_else(monkeypatc
             ends.append(session.positions())
     assert session.waits <= len(tries) <= 3 * session.waits
     np.testing.assert_allclose(ends[1], ends[0], atol=0.02 * np.abs(ends[0] - made.points).max())
+
+
+@pytest.mark.parametrize("budget", [np.inf, 0.0])
+def test_newtons_method_seeks_the_balance_of_a_whole_step_once(monkeypatch: pytest.MonkeyPatch, budget: float) -> None:
+    """Of a session that a loop steps, and of one that is stepped by itself: that one went on in up to sixteen parts, in vain."""
+    sought: list[float] = []
+
+    def nothing(self: RealTimeSession, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, Trial | None]:
+        yield
+        return None
+
+    def none_found(self: RealTimeSession, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> None:
+        sought.append(h)
+
+    monkeypatch.setattr(RealTimeSession, "_quasi_newton", nothing)
+    monkeypatch.setattr(DynamicSession, "_balanced", none_found)
+    made = engine(RealTimeEngine, background=False)
+    with made.session(constrained=held(made.points), indenters=[spherical_indenter((1.0, 2.0, SIZE + 8.2), 8.0)]) as session:
+        assert isinstance(session, RealTimeSession)
+        with pytest.raises(ConvergenceError, match="finds no balance of momentum"):
+            while session.step_within(budget, motions=DOWN) is None:
+                pass
+    assert sought == [made.step]
 
 
 def test_a_step_under_way_shows_the_parts_that_have_been_taken(monkeypatch: pytest.MonkeyPatch) -> None:
