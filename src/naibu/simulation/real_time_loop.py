@@ -83,6 +83,7 @@ class RealTimeLoop:
     _recording: bool = field(init=False, default=False)
     _record: list[Frame] = field(init=False, default_factory=list)
     _replay: deque[Frame] = field(init=False, default_factory=deque)
+    _shows_recorded: bool = field(init=False, default=False)
     _trouble: str = field(init=False, default="")
     _failure: BaseException | None = field(init=False, default=None)
     _shown: float = field(init=False, default=float("-inf"))
@@ -141,8 +142,13 @@ class RealTimeLoop:
         """Return the frames of the recording, 30 a second."""
         return tuple(self._record)
 
+    @property
+    def replaying(self) -> bool:
+        """Whether the recording is being shown, whose body may be that before a cut."""
+        return bool(self._replay)
+
     def replay(self) -> None:
-        """Show the recording again; the simulation waits meanwhile."""
+        """Show the recording again; the simulation waits meanwhile, and is shown where it is behind it."""
         self._recording = False
         self._replay = deque(self._record)
 
@@ -166,10 +172,13 @@ class RealTimeLoop:
         pause = self.simulation.frame_s
         waits = self._paused or bool(self._replay)
         if self._replay and (self.hand is None or due >= self._shown + RECORD_EVERY_S):
-            self._latest, self._shown = self._replay.popleft(), due
+            self._latest, self._shown, self._shows_recorded = self._replay.popleft(), due, True
             pause = RECORD_EVERY_S if self.hand is None else pause
         elif not waits:
+            self._shows_recorded = False
             self._advance(due)
+        elif self._shows_recorded and not self._replay:
+            self._show_simulation()
         if self.hand is not None and waits:
             self.hand.idle(pause)
         if self.hand is None or waits or self._shown == due:
@@ -193,7 +202,7 @@ class RealTimeLoop:
     def _obey(self) -> None:
         try:
             if self.simulation.finish_cut():
-                self._latest = self.simulation.last
+                self._show_simulation()
         except NaibuError as error:
             self._trouble = str(error)
         while self._commands:
@@ -201,7 +210,12 @@ class RealTimeLoop:
                 self._commands.popleft()(self.simulation)
             except NaibuError as error:
                 self._trouble = str(error)
-            self._latest = self.simulation.last
+            self._show_simulation()
+
+    def _show_simulation(self) -> None:
+        """Show the simulation where it is, unless the recording is being shown."""
+        if not self._replay:
+            self._latest, self._shows_recorded = self.simulation.last, False
 
     def _keep(self, frame: Frame) -> None:
         if not self._recording or (
@@ -219,4 +233,4 @@ class RealTimeLoop:
         simulated = sum(length for _, length in list(self._finished)[1:])
         ratio = simulated / span if span else 0.0
         steps = ratio * self.simulation.steps / self.simulation.frame_s
-        return Pace(steps, ratio, self._paused, self._recording, bool(self._replay), self.simulation.cut_stage)
+        return Pace(steps, ratio, self._paused, self._recording, self.replaying, self.simulation.cut_stage)

@@ -17,6 +17,7 @@ from naibu.core.errors import InputError
 from naibu.io.tables.blade_table import read_tip_path
 from naibu.meshing import boundary_faces, box
 from naibu.workflows import cut_surface_file
+from naibu.workflows.interactive.cut_surface import places_text
 
 SIZE = 40.0
 
@@ -262,3 +263,9 @@ def test_a_cut_whose_sides_still_hang_together_is_told(tmp_path: Path, verb: Cal
     assert code == 0 and sentence in " ".join(said.split()) and sentence in (out / "cut.html").read_text()
     gaps = [np.hypot(*(np.array([a, b]) - places[0, :2])) for a, b in zip(x, np.linspace(5.0, 38.0, 200), strict=True)]
     assert len(places) == 2 and min(gaps) < SIZE / 6
+
+
+def test_places_are_told_without_rounding() -> None:
+    """Middles of boxes came out as 1.776e-15 mm."""
+    assert places_text(np.array([[1.7763568394002505e-15, -8.0, 20.004]])) == "one place (near 0, -8, 20 mm)"
+    assert places_text(np.array([[-1e-12, 1e-5, 1234.56]])) == "one place (near 0, 1e-05, 1235 mm)"

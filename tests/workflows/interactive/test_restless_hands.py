@@ -9,6 +9,8 @@ import pytest
 from touched_models import MODELS
 from watched_page import WatchedPage, driven
 
+FRAMES = {"demo": 120}  # of a long session, less than others where a frame behind a cut takes seconds that runs be repeatable
+
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", ["lattice", "mesh", "gel"])
@@ -58,6 +60,6 @@ def test_a_cut_that_opens_in_the_frame_in_which_a_node_is_gripped_is_undone_for_
 @pytest.mark.parametrize("seed", range(1000, 1006))
 @pytest.mark.parametrize("kind", ["lattice", "cube", "dough", "dough-held", "octree", "mesh", "gel", "demo"])
 def test_random_hands_do_no_harm_for_long(kind: str, seed: int) -> None:
-    page = driven(MODELS[kind](), seed, 300, settling_s=3.0)
+    page = driven(MODELS[kind](), seed, FRAMES.get(kind, 300), settling_s=3.0)
     assert page.failures == []
     assert sum(count for said, count in page.said.items() if said.startswith("a step of")) <= 0.1 * page.frames

@@ -176,7 +176,7 @@ def incomplete_text(found: SurfaceCut, refined: bool) -> str:
 def places_text(places: FloatArray) -> str:
     """Return how many places (k, 3), mm, there are, and where the first ones are, as text."""
     count = "one place" if len(places) == 1 else f"{len(places)} places"
-    where = "; ".join(", ".join(f"{v:.4g}" for v in place) for place in places[:TOLD_PLACES])
+    where = "; ".join(", ".join(f"{round(v, 6) + 0.0:.4g}" for v in place) for place in places[:TOLD_PLACES])  # rounding is no place
     return f"{count} (near {where}{', ...' if len(places) > TOLD_PLACES else ''} mm)"
 
 

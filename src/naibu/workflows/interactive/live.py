@@ -105,6 +105,8 @@ class LiveSimulation:
         match command.kind:
             case "cut" if self._preparing:
                 loop.submit(_refuse_cut)
+            case "cut" | "grip" if loop.replaying:
+                loop.submit(_refuse_while_replaying)
             case "pause":
                 loop.pause(command.switch)
             case "record":
@@ -305,6 +307,10 @@ def _single(body: InteractiveBody, hand: HapticHand | None) -> bool:
 
 def _refuse_cut(_: InteractiveSimulation) -> None:
     raise InputError("kernels of cuts are still being compiled, which the first run does; cut when that is done")
+
+
+def _refuse_while_replaying(_: InteractiveSimulation) -> None:
+    raise InputError("the recording is being shown, whose body may not be the one that is simulated; pull and cut when it has ended")
 
 
 def _order(kind: str, command: LiveCommand, model: TouchableModel) -> Callable[[InteractiveSimulation], None]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from naibu.core.arrays import FloatArray
+from naibu.core.errors import ConvergenceError
 from naibu.mechanics import (
     Assembler,
     DynamicEngine,
@@ -23,7 +24,9 @@ from naibu.mechanics import (
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_strain.sessions import real_time_session
 from naibu.mechanics.finite_strain.sessions.divided_session import PARTS
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
+from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.trial_displacement import Trial
 from naibu.meshing import boundary_faces, box
 
@@ -105,6 +108,55 @@ def test_whole_steps_that_lead_nowhere_are_soon_taken_in_parts(monkeypatch: pyte
                 both.append(session.positions())
     assert len(tries) <= 4 * 3  # of each step: two beginnings, with two tangents; there were twice as many
     np.testing.assert_allclose(both[1], both[0], atol=0.1 * np.abs(both[0] - made.points).max())  # shorter steps damp less
+
+
+def test_iterations_whose_error_stays_end_soon_and_begin_nowhere_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A tangent of the step's own finds the balance then: an earlier one that went on, from two beginnings, took ten iterations before."""
+    taken, tries = RealTimeSession._with_contact, []
+
+    def unmoved(self: RealTimeSession, tangent: EarlierTangent, *given: Any) -> Generator[None, None, FloatArray | None]:
+        step = yield from taken(self, tangent, *given)
+        if tangent.displacement is self.reached.displacement or step is None:
+            return step
+        tries.append(1)
+        return 0.0 * step
+
+    made = engine(RealTimeEngine, background=False)
+    monkeypatch.setattr(real_time_session, "UNLIKELY", np.inf)
+    ends = []
+    for hindered in (False, True):
+        if hindered:
+            monkeypatch.setattr(RealTimeSession, "_with_contact", unmoved)
+        with made.session(constrained=held(made.points), indenters=[spherical_indenter((1.0, 2.0, SIZE + 8.2), 8.0)]) as session:
+            session.step(motions=DOWN, steps=3)
+            assert isinstance(session, RealTimeSession) and session.newton_steps == 0 and session.divided_steps == 0
+            assert (session.waits > 0) == hindered
+            ends.append(session.positions())
+    assert session.waits <= len(tries) <= 3 * session.waits
+    np.testing.assert_allclose(ends[1], ends[0], atol=0.02 * np.abs(ends[0] - made.points).max())
+
+
+@pytest.mark.parametrize("budget", [np.inf, 0.0])
+def test_newtons_method_seeks_the_balance_of_a_whole_step_once(monkeypatch: pytest.MonkeyPatch, budget: float) -> None:
+    """Of a session that a loop steps, and of one that is stepped by itself: that one went on in up to sixteen parts, in vain."""
+    sought: list[float] = []
+
+    def nothing(self: RealTimeSession, moving: FloatArray, contacts: tuple[Contact, ...]) -> Generator[None, None, Trial | None]:
+        yield
+        return None
+
+    def none_found(self: RealTimeSession, h: float, moving: FloatArray, contacts: tuple[Contact, ...]) -> None:
+        sought.append(h)
+
+    monkeypatch.setattr(RealTimeSession, "_quasi_newton", nothing)
+    monkeypatch.setattr(DynamicSession, "_balanced", none_found)
+    made = engine(RealTimeEngine, background=False)
+    with made.session(constrained=held(made.points), indenters=[spherical_indenter((1.0, 2.0, SIZE + 8.2), 8.0)]) as session:
+        assert isinstance(session, RealTimeSession)
+        with pytest.raises(ConvergenceError, match="finds no balance of momentum"):
+            while session.step_within(budget, motions=DOWN) is None:
+                pass
+    assert sought == [made.step]
 
 
 def test_a_step_under_way_shows_the_parts_that_have_been_taken(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,7 +123,11 @@ class DividedSession(NewtonSession):
     def _stepped(
         self, moving: FloatArray, along: FloatArray, spin: FloatArray, motions: Sequence[IndenterMotion]
     ) -> Generator[None, None, Forces]:
-        """Return the forces of a step: whole, in parts where its balance is not found, or by Newton's method where theirs is not either."""
+        """Return the forces of a step: whole, in parts where its balance is not found, or by Newton's method where theirs is not either.
+
+        Newton's method takes the whole step, unless an indenter would go through the body: in parts it found no balance that it had not
+        found, and that of as short parts was sought before.
+        """
         before, h, first = self.reached, self.engine.step, self._parts(moving, along, spin)
         for parts in (first, *(first * more for more in PARTS)):
             forces = yield from self._in_parts(parts, moving, along, spin)
@@ -133,10 +137,10 @@ class DividedSession(NewtonSession):
             self.reached = before
             self._forget()
         self.newton_steps += 1
-        if self._until == np.inf or first > 1:
+        if first > 1:
             return DynamicSession._advance(self, moving, along, spin, motions)
-        contacts = self._contacts(h, along, spin)
-        found = yield from self._newtons_beside(moving, contacts)
+        contacts, alone = self._contacts(h, along, spin), self._until == np.inf
+        found = self._balanced(h, moving, contacts) if alone else (yield from self._newtons_beside(moving, contacts))
         if found is None:
             raise ConvergenceError(f"a step of {h:g} s finds no balance of momentum; move the indenter more slowly, or less deep")
         return self._accepted(h, found, self._stiffer(contacts, found), spin)

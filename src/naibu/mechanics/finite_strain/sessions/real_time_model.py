@@ -16,7 +16,7 @@ from naibu.mechanics.finite_strain.lip_assembly import LipMultipliers, lips_of, 
 from naibu.mechanics.finite_strain.nearby_contact import NearbyContact
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicEngine
 from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent, SolverPool
-from naibu.mechanics.finite_strain.sessions.tangents.lips_beside_tangent import lips_about_to_change, pairs_along_normals
+from naibu.mechanics.finite_strain.sessions.tangents.lips_beside_tangent import in_threes, lips_about_to_change, pairs_along_normals
 from naibu.mechanics.linear_algebra.block_matrix import BlockPattern, block_pattern, with_dirichlet_rows
 from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
@@ -60,6 +60,11 @@ class RealTimeModel(DynamicEngine):
     def faint_mn(self) -> float:
         """Force of contact too small to be told from none, mN."""
         return FAINT * self._modulus * self._extent**2
+
+    def stiffness_at(self, nodes: IntArray, pairs: PairedMotion) -> FloatArray:
+        """Return the stiffness of the elements at nodes (k,) and, in rows of three, at pairs of the sides of cuts, mN/mm."""
+        local = self._local_stiffness
+        return np.concatenate([local[nodes], in_threes(local[pairs.nodes].mean(axis=1)).max(axis=1)])
 
 
 def _mean_edges(points: FloatArray, faces: IntArray) -> FloatArray:

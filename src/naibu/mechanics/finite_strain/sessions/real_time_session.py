@@ -30,7 +30,7 @@ from naibu.mechanics.finite_strain.sessions.session_checks import dead_load
 from naibu.mechanics.finite_strain.sessions.tangents.condensed_contact import CHANGES, UNAIDED, CondensedContact
 from naibu.mechanics.finite_strain.sessions.tangents.contact_beside_tangent import ContactBesideTangent
 from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
-from naibu.mechanics.finite_strain.sessions.tangents.lips_beside_tangent import ApproachingLips, changing_lips, in_threes, motion_in_threes
+from naibu.mechanics.finite_strain.sessions.tangents.lips_beside_tangent import ApproachingLips, changing_lips, motion_in_threes
 from naibu.mechanics.finite_strain.sessions.trial_displacement import FELT, Trial
 from naibu.mechanics.linear_algebra.anderson import AndersonMixing
 
@@ -42,6 +42,7 @@ BUDGET_S = 0.01  # of a processor for a step, after which a passable balance is 
 DIVERGED = 1e6  # out-of-balance force from which a step is tried from another beginning
 FURTHER, NEARER = 5, 0.7  # more of them, where the others reduced the error to so much of what it was before
 HOPE = 3  # iterations, behind which others are given up where the error is still above UNLIKELY
+UNMOVED = 0.02  # change of an error in each of two iterations from which it stays: with this tangent, other beginnings lead to it as well
 STALLED = 0.02  # of the contact forces: what iterations that reduce the error no longer may leave where sides of cuts rub
 FEW = 200  # nodes of contact at most with which they cost less than a tangent of the step's own
 UNLIKELY = 0.3  # error at the end of the motion from which the body at rest is tried
@@ -100,6 +101,7 @@ class RealTimeSession(DividedSession):
     _spare: bool = field(init=False, default=False)  # whether the last step took no iteration
     _vain: int = field(init=False, default=0)  # beginnings until the body at rest is tried again
     _patience: float = field(init=False, default=np.inf)  # processor time at which a step gives an earlier tangent up
+    _stays: bool = field(init=False, default=False)  # whether the last iterations ended where their error stayed, near to balance
 
     def press(self, indenters: Sequence[RigidIndenter]) -> None:
         """Bring these indenters, and no others, into play; see `DynamicSession.press`."""
@@ -201,7 +203,8 @@ class RealTimeSession(DividedSession):
         for first, near, most in self._guesses(tangent, moving, inertial, pressure, still_first=still_first):
             found = yield from self._iterated(near, first, inertial, deadline, most)
             best, self._vain = found.better(best), VAIN if near is not tangent and found.error > UNLIKELY else self._vain
-            if best.error <= ACCEPTED or time.thread_time() > self._patience:
+            elsewhere = near is not tangent or tangent.displacement is self.reached.displacement
+            if best.error <= ACCEPTED or (self._stays and not elsewhere) or time.thread_time() > self._patience:
                 break
         return best
 
@@ -256,12 +259,15 @@ class RealTimeSession(DividedSession):
     ) -> Generator[None, None, Trial]:
         """Return the best that at most so many iterations find from a beginning, in the time of a processor that there is."""
         mixing, best, begun, bulk = AndersonMixing(DEPTH), trial, trial.error, self._engine._elements.bulk
-        rubs, before = self.engine.assembler.unsymmetric, np.inf
+        rubs, before, unmoved, self._stays = self.engine.assembler.unsymmetric, np.inf, 0, False
         for near in self._near:  # gaps are those of this guess, which need not be the last one that was looked at
             near.add_force(trial.displacement, np.zeros_like(trial.contact))
         for k in range(most):
             many = self._condensed is not None and len(self._condensed.nodes) > FEW
             if k >= HOPE and best.error > UNLIKELY:
+                break
+            if unmoved == 2 and best.error > ACCEPTED:
+                self._stays = best.error <= UNLIKELY
                 break
             if k == ITERATIONS and (best.error <= ACCEPTED or best.error > NEARER * begun or many):
                 break
@@ -280,6 +286,7 @@ class RealTimeSession(DividedSession):
                 return after.better(best if k else None)  # no share of a step is of use whose contact finds no balance
             if after.error > JUMP * trial.error:
                 mixing = AndersonMixing(DEPTH)
+            unmoved = unmoved + 1 if abs(after.error - trial.error) <= UNMOVED * after.error else 0
             before, trial = trial.error, after
             best = trial.better(best if k else None)
         return best
@@ -408,18 +415,13 @@ class RealTimeSession(DividedSession):
             if time.thread_time() > self._patience:
                 return None
             yield
-        self._condensed = CondensedContact(tangent, nodes, self._stiffness_at(nodes, tangent), gripped)
+        self._condensed = CondensedContact(tangent, nodes, self._engine.stiffness_at(nodes, tangent.pairs), gripped)
         return self._condensed
 
     def _approaching(self, tangent: EarlierTangent, displacement: FloatArray) -> ApproachingLips | None:
         """Return the pairs of the sides of cuts whose approach a tangent knows, at a displacement (n, 3), mm."""
         known = tangent.pairs.n_pairs > 0
         return ApproachingLips.of(lips_of(self._elements.assembler)[0], tangent, displacement) if known else None
-
-    def _stiffness_at(self, nodes: IntArray, tangent: EarlierTangent) -> FloatArray:
-        """Return the stiffness of the elements at nodes (k,) and, in rows of three, at the pairs of a tangent, mN/mm."""
-        local = self._engine._local_stiffness
-        return np.concatenate([local[nodes], in_threes(local[tangent.pairs.nodes].mean(axis=1)).max(axis=1)])
 
     def _accepted(self, h: float, u: FloatArray, contacts: tuple[Contact, ...], spin: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Keep the end of a step; returns the forces of the bodies and of the indenters, mN."""
