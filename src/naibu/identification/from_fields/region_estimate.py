@@ -34,6 +34,7 @@ from naibu.identification.from_fields.mesh_error import (
     relative_change,
     stretch_of,
     told_of_elements,
+    weight_of_change,
 )
 from naibu.identification.from_fields.regions.border_refinement import CorrectedRegions, RefinedRegions
 from naibu.identification.from_fields.size_correction import SizeCorrection, without_size_of_elements
@@ -226,10 +227,10 @@ def _of_elements(
         return None, False
     if fit.corrected is None:
         layers, apart = np.isin(names, thin) if thin else None, np.isin(names, judged.mesh_dependent)
-        change = relative_change(shift)
+        change, weight = relative_change(shift), weight_of_change(found.size.theta - shift)
         mixed = settings.region_at is not None or not found.size.alike or fit.model.surface_sought
-        covariance = doubt_in_all(change, sure, found.quadratic.hessian, apart, mixed=mixed, thin=layers)
-        coarse = bool(sure.any()) and (bool(thin) or float(np.abs(change[sure]).max(initial=0.0)) > COARSE)
+        covariance = doubt_in_all(change, sure, found.quadratic.hessian, apart, mixed=mixed, thin=layers, weight=weight)
+        coarse = bool(sure.any()) and (bool(thin) or float(np.abs(weight * change)[sure].max(initial=0.0)) > COARSE)
     else:
         covariance, coarse = fit.corrected.doubt, not fit.corrected.converged
     return at_least_to(settings.other_mesh, found.size.theta, covariance * np.outer(found.stretch, found.stretch)), coarse
