@@ -157,13 +157,13 @@ def test_one_standard_deviation_of_elements_reaches_what_another_mesh_gives() ->
     np.testing.assert_allclose(np.sqrt(np.diag(at_least_to(other, theta, np.zeros((2, 2))))), [0.3, 0.2])
 
 
-@pytest.mark.parametrize("shape", ["cube", "barrel", "tapered"])
+@pytest.mark.parametrize("shape", ["cube", "barrel"])
 def test_a_nearly_incompressible_gel_is_told_as_well_as_another(shape: str) -> None:
     """What cells change of mu / kappa is most of it at a ratio of 0.495, and no error of Young's modulus: intervals of factor 2 held 5."""
     body = QuadraticBody(shape, unknown=(5.0, 0.495))
     mesh, loaded = body.model(6, "hexahedron")
     rng = np.random.default_rng(0)
-    points, u = body.solved((0.0, 0.0, -4.0)).at(rng.uniform(0.02, 0.98, (400, 3)))
+    points, u = body.solved((0.0, 0.0, -4.0), divisions=6).at(rng.uniform(0.02, 0.98, (400, 3)))
     field = DisplacementField.from_arrays(points, u + 0.04 * rng.standard_normal(u.shape), sd_mm=0.04)
     found = identify_field(mesh, [FieldLoadCase.of("push", field, mesh, loaded=loaded)], Zones.of(mesh, known={"known": body.known}))
     (low, high), (least, most) = (bounds[0] for bounds in found.intervals())
