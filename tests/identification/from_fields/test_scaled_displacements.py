@@ -7,7 +7,7 @@ import pytest
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT
-from naibu.identification.from_fields.assumptions.scaled_displacements import SCALED, Scaling, judged_scaling, unless_law
+from naibu.identification.from_fields.assumptions.scaled_displacements import SCALED, Scaling, judged_scaling, unless_explained
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
@@ -64,4 +64,5 @@ def test_a_growth_is_told_last_where_other_assumptions_explain_more() -> None:
 def test_a_growth_that_another_law_explains_is_not_counted() -> None:
     found, plain = Scaling(0, 0.08, 30.0, np.array([0.3, 0.0])), Verdict(Explanation.IN_PART, ("another reason",), "lead", 1.0, 0.0, 0.5)
     of_law = Verdict(Explanation.IN_PART, (DOES_NOT_FIT,), "lead", 1.0, 0.0, 0.5)
-    assert unless_law(found, of_law, 40.0) is None and unless_law(found, of_law, 20.0) is found and unless_law(found, plain, 40.0) is found
+    assert unless_explained(found, of_law, 40.0, 0.0) is None and unless_explained(found, of_law, 20.0, 0.0) is found
+    assert unless_explained(found, plain, 40.0, 0.0) is found

@@ -12,7 +12,7 @@ surface is not known.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.verdict import WITHIN_NOISE
 from naibu.identification.neighbours import neighbours
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import Verdict
 from naibu.meshing.point_location import locate, operator_of
 
 NEIGHBOURS = 124  # those of a point of a grid within two steps along each axis
@@ -118,13 +118,11 @@ def judged_averages(judged: Verdict, found: Averaging | None, zones: Zones, thet
     changes = told_changes(zones, np.log(young_and_poisson(theta + found.theta)[0] / young_and_poisson(theta)[0]))
     if not changes:
         return judged
-    part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
     why = (
         f"{AVERAGES} (smoothed, interpolated, or from large windows; a standard deviation of some {found.length_mm:.2g} mm): "
         f"if they are, Young's modulus would be another one: {changes}"
     )
-    first = judged.noise_factor <= WITHIN_NOISE
-    return replace(judged, explanation=part, reasons=(why, *judged.reasons) if first else (*judged.reasons, why))
+    return judged.in_part(why, first=judged.noise_factor <= WITHIN_NOISE)
 
 
 def _blunted(mesh: Mesh, o: Observed, u: FloatArray, length: float) -> tuple[FloatArray, BoolArray]:

@@ -26,7 +26,7 @@ from naibu.identification.from_fields.forward.forward_model import Observed, whi
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, first_point, search
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import Verdict
 from naibu.meshing.point_location import locate
 
 DECISIVE = 25.0  # of twice the logarithm of a ratio of likelihoods: five standard deviations of a normal score
@@ -72,7 +72,7 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
     best : Point
         The best fit of the fields as they are.
     of_law : float
-        By how much chi squared falls with the shape of the law free.
+        By how much chi squared falls with the shape of the law free, or with a border that slides.
     variance : float
         Of whitened residuals over that stated, errors that neighbours share counted.
     bounds : Bounds
@@ -118,12 +118,11 @@ def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, the
     better = likelier(found)
     if not better:
         return judged
-    part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
     texts = " or ".join(f"{one.text} (chi squared falls by {one.gain:.3g})" for one in better)
     changes = told_changes(zones, np.log(young_and_poisson(theta + better[0].theta)[0] / young_and_poisson(theta)[0]))
     why = CHECK.format(texts, f", which would make Young's modulus another one ({changes})" if changes else "")
     reasons = (reason for reason in judged.reasons if not reason.startswith(DOES_NOT_FIT))  # this explains more than another law
-    return replace(judged, explanation=part, reasons=(why, *reasons))
+    return replace(judged, reasons=tuple(reasons)).in_part(why)
 
 
 def _fitted(model: FieldModel, theta: FloatArray, near: Sequence[FloatArray], bounds: Bounds) -> Point | None:
