@@ -31,6 +31,7 @@ from naibu.meshing.point_location import locate
 
 DECISIVE = 25.0  # of twice the logarithm of a ratio of likelihoods: five standard deviations of a normal score
 ALIKE = 36.0  # the same of readings that may be right as well: what another law explains is only known roughly
+LEAST_PART = 0.1  # of what is left beyond noise, that a likelier reading must explain: errors of cells at finite strain look like less of it
 PROBES = 32  # random signs that estimate how much of the noise a surface follows: of a thousand components to one hundredth
 REVERSED, PLACED_LATER = "all displacements reversed", "displacements that stand where points came to lie"
 EXCHANGED = "the reference and the deformed scan exchanged"
@@ -56,11 +57,19 @@ class Reading:
     gain : float
         Twice the logarithm of its likelihood over that of the fields as they are, or of small strain or another law if that is more: a
         field that was computed at small strain lies half-way to the reversed one.
+    part : float
+        Of what these leave beyond noise, that it explains.
     """
 
     text: str
     theta: FloatArray
     gain: float
+    part: float = 1.0
+
+    @property
+    def likelier(self) -> bool:
+        """Whether the reading fits far better than the fields as they are."""
+        return self.gain > DECISIVE and self.part >= LEAST_PART
 
 
 def other_readings(model: FieldModel, best: Point, of_law: float, variance: float, bounds: Bounds) -> tuple[Reading, ...]:
@@ -94,14 +103,17 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
         if found is None:
             continue
         as_it_is = before if shift == 0.0 else _excess(model, best, [kept for _, kept in moved])
-        out.append(Reading(text, found.theta - best.theta, (as_it_is + other_law - _excess(other, found)) / variance))
+        left = as_it_is + other_law
+        fall = left - _excess(other, found)
+        out.append(Reading(text, found.theta - best.theta, fall / variance, fall / max(left, abs(fall), 1e-300)))
     return tuple(out)
 
 
 def likelier(found: Sequence[Reading]) -> tuple[Reading, ...]:
     """Return the readings that fit far better than the fields as they are, and about as well as the best of them, the best first."""
-    best = max((one.gain for one in found), default=0.0)
-    return tuple(sorted((one for one in found if one.gain > max(DECISIVE, best - DECISIVE)), key=lambda one: -one.gain))
+    better = [one for one in found if one.likelier]
+    best = max((one.gain for one in better), default=0.0)
+    return tuple(sorted((one for one in better if one.gain > best - DECISIVE), key=lambda one: -one.gain))
 
 
 def covariance_of_readings(found: Sequence[Reading], size: int) -> FloatArray:
@@ -111,7 +123,7 @@ def covariance_of_readings(found: Sequence[Reading], size: int) -> FloatArray:
 
 def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, theta: FloatArray) -> Verdict:
     """Return the verdict with the readings that fit far better than the fields as they are first, and in a note those that fit as well."""
-    alike = [one.text for one in found if -ALIKE <= one.gain <= DECISIVE]
+    alike = [one.text for one in found if one.gain >= -ALIKE and not one.likelier]
     if alike:
         told = f"The fields would fit as well with {' or '.join(alike)}: that they are neither is taken for given."
         judged = replace(judged, notes=(*judged.notes, told.replace("neither", "not") if len(alike) == 1 else told))
