@@ -140,7 +140,7 @@ def doubt_of(
     would find otherwise (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size. If regions
     are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than `ITSELF` times as
     much. Logarithms that the measurement does not determine move at no cost to the fit, and tell nothing of others: only those that are
-    `sure` (2 count,) count as the worst, by `weight` (2 count,), see `weight_of_change`, and each gets at least the doubt of its own change.
+    `sure` (2 count,) count as the worst, by `weight` (2 count,) of `weight_of_change`, and each gets at least the doubt of its own change.
     """
     told = np.abs(shift if weight is None else weight * shift)[slice(None) if sure is None else sure]
     worst = max(float(told.max(initial=0.0)), 0.0 if thin is None else THIN)

@@ -31,7 +31,7 @@ from naibu.meshing.point_location import locate
 
 DECISIVE = 25.0  # of twice the logarithm of a ratio of likelihoods: five standard deviations of a normal score
 ALIKE = 36.0  # the same of readings that may be right as well: what another law explains is only known roughly
-LEAST_PART = 0.1  # of what is left beyond noise, that a likelier reading must explain: errors of cells at finite strain look like less of it
+LEAST_PART = 0.1  # of what is left beyond noise, that a likelier reading must explain: errors of cells look like less of it
 PROBES = 32  # random signs that estimate how much of the noise a surface follows: of a thousand components to one hundredth
 REVERSED, PLACED_LATER = "all displacements reversed", "displacements that stand where points came to lie"
 EXCHANGED = "the reference and the deformed scan exchanged"

@@ -202,4 +202,4 @@ def _of_jump(mesh: Mesh, o: Observed, jump: FloatArray, side: BoolArray) -> Floa
     """Return the whitened jump (q,) within the cells of the second zone."""
     there = locate(mesh, o.points, tolerance_mm=np.inf)
     inside = np.where(side[there.cells][:, None], operator_of(mesh, there) @ jump, 0.0)
-    return np.einsum("nij,nj->ni", whitening(o.load_case.field, o.load_case.name)[0], inside).ravel()
+    return np.asarray(np.einsum("nij,nj->ni", whitening(o.load_case.field, o.load_case.name)[0], inside).ravel())

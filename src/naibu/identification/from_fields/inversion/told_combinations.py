@@ -21,6 +21,6 @@ def told(information: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def bounded_covariance(information: FloatArray) -> FloatArray:
-    """Return the inverse of information (k, k) on logarithms, which rounding may leave below 0, as if it were enough for bounds at least."""
+    """Return the inverse of information (k, k) on logarithms, which rounding may leave below 0, as if it gave bounds at least."""
     values, vectors = np.linalg.eigh(information)
     return np.asarray(vectors / np.maximum(values, LEAST_INFORMATION) @ vectors.T)
