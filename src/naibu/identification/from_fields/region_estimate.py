@@ -100,7 +100,7 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     test = ScoreTest.of(found.at, found.quadratic, finer)
     ratios, scaling = asked_ratios(test, variance, found.stretch), asked_scaling(test, variance, found.stretch)
     judged, thin = _judged(fit, found, settings)
-    averages = averaging(test, found.size.residuals, found.stretch)
+    averages = averaging(test, found.size.residuals, found.stretch, settings.bounds)
     of_elements, coarse = _of_elements(fit, found, settings, judged, thin)
     total = found.of_noise.with_added(of_known + doubt_of_ratios(ratios, len(of_known))).with_law(law)
     total = total if of_elements is None else total.with_added(of_elements)

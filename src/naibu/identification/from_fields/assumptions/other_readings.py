@@ -17,7 +17,6 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import report_progress
 from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, LEAST_STRAIN, largest_strain, told_changes
@@ -25,7 +24,7 @@ from naibu.identification.from_fields.assumptions.volume_change import mean_grad
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, young_and_poisson
-from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, first_point, search
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, fitted_near
 from naibu.identification.verdict import Verdict
 from naibu.meshing.point_location import locate
 
@@ -36,7 +35,6 @@ PROBES = 32  # random signs that estimate how much of the noise a surface follow
 REVERSED, PLACED_LATER = "all displacements reversed", "displacements that stand where points came to lie"
 EXCHANGED = "the reference and the deformed scan exchanged"
 READINGS = {REVERSED: (0.0, -1.0), PLACED_LATER: (-1.0, 1.0), EXCHANGED: (1.0, -1.0)}  # vectors that are added to points, and their sign
-ROUGHLY = SearchSettings(max_iterations=10, tolerance=1e-3)
 MOST_LOST = 0.4  # of the points, that another reading may put outside of the body: where it puts more there it is none
 ON_SURFACE = 1e-6  # mm
 CHECK = (
@@ -89,7 +87,7 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
     """
     if model.law.linear or largest_strain(model, best.states) < LEAST_STRAIN:
         return ()
-    small = _fitted(model.with_law("linear"), best.theta, best.states, bounds)
+    small = fitted_near(model.with_law("linear"), best.theta, best.states, bounds)
     otherwise = 0.0 if small is None else small.misfit - best.misfit
     other_law, out = min(0.0, otherwise, -of_law), []
     before = _excess(model, best)
@@ -99,7 +97,7 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
         if any(kept.mean() < 1.0 - MOST_LOST for _, kept in moved):
             continue
         other = _measured_as(model, [field for field, _ in moved])
-        found = _fitted(other, best.theta, [sign * u for u in best.states], bounds)
+        found = fitted_near(other, best.theta, [sign * u for u in best.states], bounds)
         if found is None:
             continue
         as_it_is = before if shift == 0.0 else _excess(model, best, [kept for _, kept in moved])
@@ -137,14 +135,6 @@ def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, the
     return replace(judged, reasons=tuple(reasons)).in_part(why)
 
 
-def _fitted(model: FieldModel, theta: FloatArray, near: Sequence[FloatArray], bounds: Bounds) -> Point | None:
-    """Return the best fit from some moduli and a motion near by; None where no equilibrium is found."""
-    try:
-        return search(model, _start(model, theta, near), Objective(bounds=bounds), ROUGHLY, progress=model.progress).point
-    except ConvergenceError:
-        return None
-
-
 def _excess(model: FieldModel, point: Point, kept: Sequence[BoolArray] | None = None) -> float:
     """Return by how much chi squared exceeds what noise alone leaves, of some points (k,).
 
@@ -162,13 +152,6 @@ def _excess(model: FieldModel, point: Point, kept: Sequence[BoolArray] | None = 
         counted = (o.residual(point.states[t]) ** 2 - free).reshape(-1, o.load_case.field.points.shape[1])
         total += float(counted.sum() if kept is None else counted[kept[t]].sum())
     return total
-
-
-def _start(model: FieldModel, theta: FloatArray, near: Sequence[FloatArray]) -> Point:
-    try:
-        return model.evaluate(theta, near)
-    except ConvergenceError:
-        return first_point(model, theta)
 
 
 def _measured_as(model: FieldModel, fields: Sequence[DisplacementField]) -> FieldModel:
