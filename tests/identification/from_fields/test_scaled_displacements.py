@@ -58,6 +58,7 @@ def test_a_growth_is_told_last_where_other_assumptions_explain_more() -> None:
         told = judged_scaling(plain, found, zones, theta, total, explained)
         assert "grow by 8 % along x" in told.reasons[place] and "that of unknown 35 % higher" in told.reasons[place]
     assert judged_scaling(plain, None, zones, theta, total, 0.0) is plain
+    assert judged_scaling(plain, found, zones, theta, total, 20.0, coarse=True) is plain  # errors of elements are not known then
     assert judged_scaling(plain, Scaling(0, 0.08, 30.0, np.array([0.01, 0.0])), zones, theta, total, 0.0) is plain
 
 

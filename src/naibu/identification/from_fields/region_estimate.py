@@ -121,7 +121,7 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     explained = max(of_free, *[one.fall for one in ratios], EXPLAINS * (found.misfit - fit.freedom))
     averages = None if of_sliding > explained else averages  # neighbours share what a jump leaves as well
     judged = judged_averages(judged_ratios(judged, ratios, model.zones, theta), averages, model.zones, theta)
-    judged = judged_scaling(judged, scaling, model.zones, theta, total, explained)
+    judged = judged_scaling(judged, scaling, model.zones, theta, total, explained, coarse=coarse)
     judged = judged_sliding(judged, sliding, model.zones, theta, explained)
     doubts = sum(np.outer(one.theta, one.theta) for one in (averages, scaling, sliding) if one is not None)
     total = total.with_added(covariance_of_readings(readings, len(theta)) + doubts)

@@ -95,13 +95,21 @@ def unless_explained(found: Scaling | None, judged: Verdict, of_law: float, of_s
 
 
 def judged_scaling(
-    judged: Verdict, found: Scaling | None, zones: Zones, theta: FloatArray, total: Uncertainty, explained: float
+    judged: Verdict,
+    found: Scaling | None,
+    zones: Zones,
+    theta: FloatArray,
+    total: Uncertainty,
+    explained: float,
+    *,
+    coarse: bool = False,
 ) -> Verdict:
     """Return the verdict with a growth of displacements, where moduli would change by much or leave their intervals without it.
 
-    It is the first reason where chi squared falls with it by more than `explained`, the last one otherwise.
+    It is the first reason where chi squared falls with it by more than `explained`, the last one otherwise. Where elements are too `coarse`
+    for what half their size changes to be their error, it is none: bones of few cells across looked like a growth by a half.
     """
-    if found is None:
+    if found is None or coarse:
         return judged
     changes = _told(found, zones, theta, total)
     if not changes:
