@@ -137,7 +137,8 @@ def _fitted(at: Linearised, lengths: Sequence[float], bounds: Bounds) -> tuple[f
 
     Lengths are standard deviations for every load case, mm, 0 for none.
     """
-    model, best, least = at.model, (1.0, None), np.inf
+    model, least = at.model, np.inf
+    best: tuple[float, FloatArray | None] = (1.0, None)
     for times in LONGER ** np.arange(TRIED):
         averaged = copy(model)
         averaged.observed = tuple(_averaged(model.computed, o, times * s) for o, s in zip(model.observed, lengths, strict=True))
@@ -152,7 +153,9 @@ def _averaged(mesh: Mesh, o: Observed, length: float) -> Observed:
     """Return measurements that are averages of the model's displacement over a kernel."""
     if length == 0.0:
         return o
-    average = sum(WEIGHT * operator_of(mesh, locate(mesh, o.points + step, tolerance_mm=np.inf)) for step in _steps(length))
+    average = sp.csr_array((len(o.points), mesh.n_points))
+    for step in _steps(length):
+        average = average + WEIGHT * operator_of(mesh, locate(mesh, o.points + step, tolerance_mm=np.inf))
     whiten, d = whitening(o.load_case.field, o.load_case.name)[0], o.points.shape[1]
     blocks = np.arange(len(whiten) + 1)
     operator = (sp.bsr_matrix((whiten, blocks[:-1], blocks)).tocsr() @ sp.kron(average, sp.identity(d), format="csr")).tocsr()
