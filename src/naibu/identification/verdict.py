@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -77,6 +77,11 @@ class Verdict:
     def reservation(self) -> str:
         """The sentence where something speaks against the model, else nothing."""
         return "" if self.explanation is Explanation.EXPLAINED and not self.limits else self.sentence
+
+    def in_part(self, reason: str, *, first: bool = True) -> Verdict:
+        """Return the verdict with one more reason, before or after the others: what was explained is so in part."""
+        part = Explanation.IN_PART if self.explanation is Explanation.EXPLAINED else self.explanation
+        return replace(self, explanation=part, reasons=(reason, *self.reasons) if first else (*self.reasons, reason))
 
     def to_dict(self) -> dict[str, Any]:
         """Return what a file of results tells of it."""

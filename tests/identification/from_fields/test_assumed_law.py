@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from naibu.identification.from_fields.assumptions.assumed_law import (
     told_changes,
     warned,
 )
-from naibu.identification.from_fields.assumptions.free_law import FreeLaw
+from naibu.identification.from_fields.assumptions.free_law import FreeLaw, _Joint
 from naibu.identification.from_fields.assumptions.known_ratios import DOES_NOT_FIT as RATIO_DOES_NOT_FIT
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
@@ -190,3 +192,16 @@ def test_a_wrong_poisson_ratio_of_a_known_gel_is_told_with_what_the_field_asks_f
     assert RATIO_DOES_NOT_FIT not in right.verdict.sentence
     low, high = wrong.intervals()[0][0]
     assert low < HARD < high
+
+
+def test_a_combination_that_data_leave_open_is_no_root_of_less_than_none() -> None:
+    """Rounding left its information just below 0, and numpy warned of the root of a negative variance."""
+    turned = np.linalg.qr(np.random.default_rng(0).standard_normal((2, 2)))[0]
+    quadratic: Any = SimpleNamespace(hessian=turned @ np.diag([1e4, -1e-9]) @ turned.T)
+    there: Any = SimpleNamespace(added=np.zeros(1), point=SimpleNamespace(theta=np.zeros(2)))
+    search: Any = SimpleNamespace(precision=np.ones(1), centre=np.zeros(1), n_shapes=1)
+    moved = 0.02 * turned[:, :1] @ np.array([[1.0, 0.0]])
+    joint = _Joint(there, quadratic, moved, [], [], np.eye(2), 1.0)
+    with np.errstate(all="raise"):
+        settled = joint.step(search).standard_deviations
+    assert 0.0 < settled <= 2.0  # a step of two standard deviations of the combination that the data tell

@@ -7,7 +7,7 @@ import pytest
 
 from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT
-from naibu.identification.from_fields.assumptions.scaled_displacements import SCALED, Scaling, judged_scaling, unless_law
+from naibu.identification.from_fields.assumptions.scaled_displacements import SCALED, Scaling, judged_scaling, unless_explained
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
@@ -58,10 +58,12 @@ def test_a_growth_is_told_last_where_other_assumptions_explain_more() -> None:
         told = judged_scaling(plain, found, zones, theta, total, explained)
         assert "grow by 8 % along x" in told.reasons[place] and "that of unknown 35 % higher" in told.reasons[place]
     assert judged_scaling(plain, None, zones, theta, total, 0.0) is plain
+    assert judged_scaling(plain, found, zones, theta, total, 20.0, coarse=True) is plain  # errors of elements are not known then
     assert judged_scaling(plain, Scaling(0, 0.08, 30.0, np.array([0.01, 0.0])), zones, theta, total, 0.0) is plain
 
 
 def test_a_growth_that_another_law_explains_is_not_counted() -> None:
     found, plain = Scaling(0, 0.08, 30.0, np.array([0.3, 0.0])), Verdict(Explanation.IN_PART, ("another reason",), "lead", 1.0, 0.0, 0.5)
     of_law = Verdict(Explanation.IN_PART, (DOES_NOT_FIT,), "lead", 1.0, 0.0, 0.5)
-    assert unless_law(found, of_law, 40.0) is None and unless_law(found, of_law, 20.0) is found and unless_law(found, plain, 40.0) is found
+    assert unless_explained(found, of_law, 40.0, 0.0) is None and unless_explained(found, of_law, 20.0, 0.0) is found
+    assert unless_explained(found, plain, 40.0, 0.0) is found

@@ -63,6 +63,18 @@ def test_smaller_elements_are_no_advice_where_the_measurement_determines_nothing
     assert "smaller" not in judged.sentence and "measure more points" in judged.sentence
 
 
+def test_a_nearly_incompressible_zone_whose_ratio_moves_passes() -> None:
+    """From 0.497 to 0.4995, cells took off most of mu / kappa, which is as little of any modulus as from 0.45 to 0.453."""
+    muscle, skin = (11.0, 0.45), (24.0, 0.497)
+    fitted, theta = (
+        logarithms(*(np.array(v) for v in zip(*(lame_parameters(*one) for one in zones), strict=True)))
+        for zones in ((muscle, skin), (muscle, (24.1, 0.4995)))
+    )
+    sure = np.diag(np.full(4, 0.02))
+    moved = HalfSize(fitted, theta, Uncertainty(np.linalg.inv(sure), sure), (0.0, 0.0))
+    assert judged_within_cells(EXPLAINED, NAMES, moved) == EXPLAINED
+
+
 def test_moduli_that_stay_leave_the_verdict_as_it_is() -> None:
     assert judged_within_cells(IN_PART, NAMES, half((10.0, 26.0), (0.46, 0.41))) == IN_PART
 

@@ -11,7 +11,7 @@ from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.workflows.fields.block_mesh import block_mesh
-from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, measured_load_case, placed_on_scan
+from naibu.workflows.fields.measured_load_case import beyond_object, beyond_rim, doubts_of_field, measured_load_case, placed_on_scan
 
 SIDE_MM = 40.0
 INSIDE = Volume.from_array(np.ones((20, 20, 20), np.uint8), spacing_mm=(2.0,) * 3, origin_mm=(1.0,) * 3)
@@ -117,3 +117,21 @@ def test_points_that_were_not_measured_are_doubted_where_they_are_zero(zeros: in
     vectors[:zeros] = 0.0
     lines = doubts_of_field("push", DisplacementField.from_arrays(POINTS, vectors))
     assert any(f"displacement of {zeros} of 300 points in the object is exactly zero" in line for line in lines) == told
+
+
+@pytest.mark.parametrize("size_mm", [(1.0, 1.0, 1.0), (1.0, 1.0, 2.0)])
+def test_a_mask_smaller_than_the_object_is_told_by_the_points_around_it(size_mm: tuple[float, float, float]) -> None:
+    """Points that fill a ball, and masks of balls: the right one, and some that leave out a shell."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-20.0, 20.0, (20_000, 3))
+    points = points[np.linalg.norm(points, axis=1) < 20.0]
+    field = DisplacementField.from_arrays(points, 0.1 * points)
+    axes = [np.arange(-24.0, 24.1, step) for step in size_mm]
+    radius = np.sqrt(axes[2][:, None, None] ** 2 + axes[1][:, None] ** 2 + axes[0] ** 2)
+    told = [
+        beyond_rim("push", field, Volume.from_array((radius < r).astype(np.uint8), spacing_mm=size_mm, origin_mm=(-24.0,) * 3))
+        for r in (20.5, 20.0, 18.9, 10.0)
+    ]
+    assert told[0] == told[1] == () and told[3] == ()  # far outside of the last one, another sentence is told
+    thickness = float(told[2][0].split("a rim of ")[1].split(" mm")[0])
+    assert 0.6 < thickness < 1.2  # faces of voxels are half as large again as a ball, and a shell is larger than its inner side

@@ -32,6 +32,7 @@ DOUBT = (
 )
 DOUBT_OF_RATIO = 0.9  # the same of mu / kappa: it feels most what flat faces cost a curved body, which half the size does not show
 COARSE = 0.25  # change of a logarithm from which extrapolation is not trusted: then every modulus gets the doubt of the worst
+COMPRESSIBLE = 3.0 / 29.0  # mu / kappa at a Poisson's ratio of 0.45, over which its changes are judged where it is less
 THIN = 0.5  # as large a change is reckoned with where a zone is one cell thick, which the change to half the size does not tell
 ITSELF = 3.0  # times as much for the moduli of that zone: skins of virtual legs came out several times too soft
 ONE_CELL = 0.25  # part of the cells of a zone that lie between others on opposite sides, from which it is called one cell thick
@@ -88,6 +89,17 @@ def relative_change(shift: FloatArray) -> FloatArray:
     return np.concatenate([shift[:k], -np.expm1(-shift[k:])])
 
 
+def weight_of_change(fitted: FloatArray) -> FloatArray:
+    """Return how much of the relative changes of ln mu and mu / kappa (2 count,) tells of too large elements, 1 of ln mu.
+
+    Elements are too compressible by an amount of mu / kappa that hardly depends on its value. Near incompressibility that is all of it,
+    however small the elements, and says nothing of other moduli; so a change of mu / kappa weighs as much as in a material of a Poisson's
+    ratio of 0.45. `fitted` (2 count,) are the logarithms on the mesh.
+    """
+    k = len(fitted) // 2
+    return np.concatenate([np.ones(k), np.minimum(np.exp(-fitted[k:]) / COMPRESSIBLE, 1.0)])
+
+
 def one_cell_thick(mesh: Mesh) -> tuple[str, ...]:
     """Return the names of regions that are one hexahedron thick in a large part, from one side or another.
 
@@ -113,7 +125,12 @@ def told_of_elements(coarse: bool, thin: Sequence[str]) -> tuple[str, ...]:
 
 
 def doubt_of(
-    shift: FloatArray, *, mixed: bool = False, thin: BoolArray | None = None, sure: BoolArray | None = None
+    shift: FloatArray,
+    *,
+    mixed: bool = False,
+    thin: BoolArray | None = None,
+    sure: BoolArray | None = None,
+    weight: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return standard deviations (2 count,) and covariance (2 count, 2 count) of extrapolated logarithms that changed by `shift`.
 
@@ -123,9 +140,9 @@ def doubt_of(
     would find otherwise (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size. If regions
     are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than `ITSELF` times as
     much. Logarithms that the measurement does not determine move at no cost to the fit, and tell nothing of others: only those that are
-    `sure` (2 count,) count as the worst, and each gets at least the doubt of its own change.
+    `sure` (2 count,) count as the worst, by `weight` (2 count,) of `weight_of_change`, and each gets at least the doubt of its own change.
     """
-    told = np.abs(shift) if sure is None else np.abs(shift[sure])
+    told = np.abs(shift if weight is None else weight * shift)[slice(None) if sure is None else sure]
     worst = max(float(told.max(initial=0.0)), 0.0 if thin is None else THIN)
     part = 1.0 if mixed else DOUBT
     if worst > COARSE:
@@ -151,14 +168,21 @@ def carried_over(covariance: FloatArray, information: FloatArray, apart: BoolArr
 
 
 def doubt_in_all(
-    relative: FloatArray, sure: BoolArray, information: FloatArray, apart: BoolArray, *, mixed: bool, thin: BoolArray | None
+    relative: FloatArray,
+    sure: BoolArray,
+    information: FloatArray,
+    apart: BoolArray,
+    *,
+    mixed: bool,
+    thin: BoolArray | None,
+    weight: FloatArray | None = None,
 ) -> FloatArray:
     """Return the covariance (2 count, 2 count) of `doubt_of`, that of zones set `apart` (count,) carried over to all others.
 
     The change of zones set apart says nothing of how wrong others are but by that way, and does not count as the worst.
     """
     both = np.tile(apart, 2)
-    _, covariance = doubt_of(relative, mixed=mixed, thin=thin, sure=sure & ~both)
+    _, covariance = doubt_of(relative, mixed=mixed, thin=thin, sure=sure & ~both, weight=weight)
     return carried_over(covariance, information, both) if apart.any() else covariance
 
 

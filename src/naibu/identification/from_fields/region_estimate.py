@@ -18,9 +18,10 @@ from naibu.identification.from_fields.assumptions.scaled_displacements import (
     EXPLAINS,
     asked_scaling,
     judged_scaling,
-    unless_law,
+    unless_explained,
 )
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
+from naibu.identification.from_fields.assumptions.sliding_borders import asked_sliding, judged_sliding
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
@@ -34,6 +35,7 @@ from naibu.identification.from_fields.mesh_error import (
     relative_change,
     stretch_of,
     told_of_elements,
+    weight_of_change,
 )
 from naibu.identification.from_fields.regions.border_refinement import CorrectedRegions, RefinedRegions
 from naibu.identification.from_fields.size_correction import SizeCorrection, without_size_of_elements
@@ -98,7 +100,7 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     test = ScoreTest.of(found.at, found.quadratic, finer)
     ratios, scaling = asked_ratios(test, variance, found.stretch), asked_scaling(test, variance, found.stretch)
     judged, thin = _judged(fit, found, settings)
-    averages = averaging(test, found.size.residuals, found.stretch)
+    averages = averaging(test, found.size.residuals, found.stretch, settings.bounds)
     of_elements, coarse = _of_elements(fit, found, settings, judged, thin)
     total = found.of_noise.with_added(of_known + doubt_of_ratios(ratios, len(of_known))).with_law(law)
     total = total if of_elements is None else total.with_added(of_elements)
@@ -111,13 +113,17 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     known = found.size.shift is not None and found.size.alike
     judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total, elements_known=known)
     of_free = 0.0 if free is None else free.fall
-    scaling = unless_law(scaling, judged, of_free)
-    readings = other_readings(model, fit.point, of_free, variance, settings.bounds)
+    sliding = asked_sliding(test, variance, found.stretch) if fit.refined is None else None
+    of_sliding = 0.0 if sliding is None else sliding.fall
+    scaling = unless_explained(scaling, judged, of_free, of_sliding)
+    readings = other_readings(model, fit.point, max(of_free, of_sliding), variance, settings.bounds)
     judged = judged_readings(judged, readings, model.zones, theta)
-    judged = judged_averages(judged_ratios(judged, ratios, model.zones, theta), averages, model.zones, theta)
     explained = max(of_free, *[one.fall for one in ratios], EXPLAINS * (found.misfit - fit.freedom))
-    judged = judged_scaling(judged, scaling, model.zones, theta, total, explained)
-    doubts = sum(np.outer(one.theta, one.theta) for one in (averages, scaling) if one is not None)
+    averages = None if of_sliding > explained else averages  # neighbours share what a jump leaves as well
+    judged = judged_averages(judged_ratios(judged, ratios, model.zones, theta), averages, model.zones, theta)
+    judged = judged_scaling(judged, scaling, model.zones, theta, total, explained, coarse=coarse)
+    judged = judged_sliding(judged, sliding, model.zones, theta, explained)
+    doubts = sum(np.outer(one.theta, one.theta) for one in (averages, scaling, sliding) if one is not None)
     total = total.with_added(covariance_of_readings(readings, len(theta)) + doubts)
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))
@@ -226,10 +232,10 @@ def _of_elements(
         return None, False
     if fit.corrected is None:
         layers, apart = np.isin(names, thin) if thin else None, np.isin(names, judged.mesh_dependent)
-        change = relative_change(shift)
+        change, weight = relative_change(shift), weight_of_change(found.size.theta - shift)
         mixed = settings.region_at is not None or not found.size.alike or fit.model.surface_sought
-        covariance = doubt_in_all(change, sure, found.quadratic.hessian, apart, mixed=mixed, thin=layers)
-        coarse = bool(sure.any()) and (bool(thin) or float(np.abs(change[sure]).max(initial=0.0)) > COARSE)
+        covariance = doubt_in_all(change, sure, found.quadratic.hessian, apart, mixed=mixed, thin=layers, weight=weight)
+        coarse = bool(sure.any()) and (bool(thin) or float(np.abs(weight * change)[sure].max(initial=0.0)) > COARSE)
     else:
         covariance, coarse = fit.corrected.doubt, not fit.corrected.converged
     return at_least_to(settings.other_mesh, found.size.theta, covariance * np.outer(found.stretch, found.stretch)), coarse

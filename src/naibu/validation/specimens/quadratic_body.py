@@ -56,7 +56,7 @@ class Solved(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class QuadraticBody:
-    """A body whose lower half is unknown and whose upper half is known, bonded to a fixed floor and to a plate on top.
+    """A body whose lower half is unknown and whose upper half is known, between a fixed floor and a plate on top, bonded to both.
 
     Attributes
     ----------
@@ -66,12 +66,15 @@ class QuadraticBody:
         Young's modulus, kPa, and Poisson's ratio of the lower and of the upper half.
     inclusions : tuple of Inclusion
         Spheres in either half.
+    sliding : bool
+        Whether the halves slide along each other without friction, and stay in touch; otherwise they are bonded.
     """
 
     name: str
     unknown: tuple[float, float] = UNKNOWN
     known: tuple[float, float] = KNOWN
     inclusions: tuple[Inclusion, ...] = ()
+    sliding: bool = False
 
     def solved(self, push: ArrayLike, divisions: int = 8) -> Solved:
         """Return the equilibrium when the plate moves by `push` (3,), mm; `divisions` elements a side, even."""
@@ -84,15 +87,20 @@ class QuadraticBody:
         at = np.einsum("qa,mai->mqi", np.stack([_shape(_GAUSS[0][list(q)])[0] for q in np.ndindex(3, 3, 3)]), points[cells])
         for one in self.inclusions:
             moduli[one.holds(at)] = _lame(one.young_modulus, one.poisson_ratio)
+        points, cells, tied = _parted(points, cells, upper) if self.sliding else (points, cells, None)
+        z = points[:, 2]
         fixed = np.repeat((z < 1e-9) | (z > SIDE_MM - 1e-9), 3)
         u: FloatArray = np.where((z > 0.5 * SIDE_MM)[:, None], np.asarray(push, dtype=float), 0.0).ravel() * fixed
         matrix = _stiffness(points, cells, *np.moveaxis(moduli, -1, 0))
+        if tied is not None:
+            matrix = (tied.T @ matrix @ tied).tocsr()
+            fixed |= np.asarray(tied.sum(axis=0)).ravel() == 0.0
         free = sp.diags((~fixed).astype(float))
         right = -(free @ (matrix @ u))
         held = sp.bsr_matrix(free @ matrix @ free + sp.diags(fixed * matrix.diagonal().mean()), blocksize=(3, 3))
         held.sort_indices()
         u = u + direct_solver(held, symmetric=True).factorize(held).solve(right)
-        return Solved(points, cells, u.reshape(-1, 3), divisions)
+        return Solved(points, cells, (u if tied is None else tied @ u).reshape(-1, 3), divisions)
 
     def model(self, cells: int, cell_type: str) -> tuple[Mesh, BoolArray]:
         """Return a mesh of linear cells, `cells` a side, with regions "unknown" and "known", and which nodes (n,) floor and plate load."""
@@ -137,6 +145,21 @@ def _cells(n: int) -> IntArray:
     number = np.arange((2 * n + 1) ** 3).reshape((2 * n + 1,) * 3)
     corners = np.ndindex(n, n, n)
     return np.array([number[2 * k : 2 * k + 3, 2 * j : 2 * j + 3, 2 * i : 2 * i + 3].ravel() for k, j, i in corners])
+
+
+def _parted(points: FloatArray, cells: IntArray, upper: BoolArray) -> tuple[FloatArray, IntArray, sp.csr_matrix]:
+    """Return nodes and cells with nodes of the upper cells (m,) of their own on the border, which is level, and what ties the heights.
+
+    The matrix (3 n, 3 n) gives all displacements from those that are free: the height of the new nodes is that of the old ones.
+    """
+    border = np.intersect1d(cells[upper], cells[~upper])
+    own = np.arange(len(points))
+    own[border] = len(points) + np.arange(len(border))
+    free = np.arange(3 * (len(points) + len(border)))
+    free[3 * own[border] + 2] = 3 * border + 2
+    ones = np.ones(len(free))
+    tied = sp.csr_matrix((ones, (np.arange(len(free)), free)), shape=(len(free),) * 2)
+    return np.concatenate([points, points[border]]), np.where(upper[:, None], own[cells], cells), tied
 
 
 def _stiffness(points: FloatArray, cells: IntArray, lame: FloatArray, shear: FloatArray) -> sp.csr_matrix:

@@ -43,7 +43,7 @@ from naibu.workflows.fields.cells_of_map import cubes_of_map
 from naibu.workflows.fields.cells_of_zones import POINTS_OF_CELL, cubes_of_zones
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
 from naibu.workflows.fields.likely_components import require_likely_components
-from naibu.workflows.fields.measured_load_case import beyond_object, doubts_of_field, placed_on_scan, relative_deformation
+from naibu.workflows.fields.measured_load_case import beyond_object, beyond_rim, doubts_of_field, placed_on_scan, relative_deformation
 from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ObjectOnCubes, ScannedObject, identified_on_smaller_cubes
 from naibu.workflows.fields.thin_coverings import Covering, told_left_out
 from naibu.workflows.results.files_together import written_together
@@ -237,6 +237,8 @@ def _told(
     """Return all that is to be told of a result, and of that what makes the fields doubtful and what cubes leave out or count as noise."""
     corrected, scanned = cubes.region_at is not None and found.mesh_shift is not None, cubes.scanned
     doubts += tuple(told for name, field in scanned.fields for told in beyond_object(name, field, scanned.whole))
+    if scanned.loaded:
+        doubts += tuple(told for name, field in scanned.fields for told in beyond_rim(name, field, scanned.whole))
     doubts += tuple(told for case in cubes.load_cases for told in doubts_of_field(case.name, case.field))
     coarse = (*blurred(cubes.left_out, cubes.wrong, cubes.lost, corrected=corrected), *cubes.noise)
     return (*found.identifiability[:1], *doubts, *found.identifiability[1:], *coarse, *longer), (*doubts, *coarse)

@@ -22,6 +22,7 @@ THINNEST = 0.1  # of a cell: points that span less along a direction do not tell
 MOST_POINTS = 10_000  # measurements of a load case: neighbours in a field say the same
 LEAST_DEFORMATION, LARGEST_DEFORMATION = 1e-6, 0.5  # RMS of what a rigid motion leaves, part of the extent of the object
 MOST_BEYOND = 0.2  # of the points outside of the object: more than its rim
+RIM = 0.25  # voxels: that thick is what a mask leaves out of an object; right ones leave out a tenth, since voxels jut out as well
 LIKELY = 0.5  # of the points in the object, and of its extent: from here on another unit or frame is named as likely
 ZERO = 5, 0.01  # points, and part of them, with a displacement of exactly zero: no measurement is that by chance
 TINY_DEFORMATION = 1e-4  # so little is usual for waves and interferometry, and for scans and particles is a sign of another unit
@@ -188,6 +189,33 @@ def beyond_object(name: str, field: DisplacementField, inside: Volume) -> tuple[
     return (
         f"{name}: {100 * share:.0f} % of its points lie outside of the object that the mask or the zones show, and are not used. "
         "Does that volume show all of the object that was measured, on the grid of the scan?",
+    )
+
+
+def beyond_rim(name: str, field: DisplacementField, inside: Volume) -> tuple[str, ...]:
+    """Say how thick a rim of the object a mask leaves out, by how many points lie outside of it, where that is more than voxels do.
+
+    Where surfaces are free, the model has them where the mask ends. As many points of equal density as lie outside take up a rim of the
+    volume of the mask times their number over that of the others, over its surface.
+    """
+    at, voxels = field.at_points(), np.pad(np.asarray(inside.values != 0), 1)
+    index = np.round(inside.to_index(at.points[at.valid])).astype(int)[:, ::-1] + 1
+    near = np.asarray(((index >= 0) & (index < voxels.shape)).all(axis=1))
+    within = np.zeros(len(index), dtype=bool)
+    within[near] = voxels[tuple(index[near].T)]
+    share = 1.0 - float(within.mean())
+    if not 0.0 < share <= MOST_BEYOND:
+        return ()
+    size = np.asarray(inside.spacing_mm)[::-1]  # along the axes of the array
+    faces = np.array([np.count_nonzero(np.diff(voxels, axis=a)) for a in range(3)])
+    volume = float(np.prod(size)) * np.count_nonzero(voxels)
+    thick = share / (1.0 - share) * volume / float(faces @ (np.prod(size) / size))
+    if thick <= RIM * float(np.cbrt(np.prod(size))):
+        return ()
+    return (
+        f"{name}: {100 * share:.0f} % of its points lie outside of the object that the mask or the zones show, as many as in a rim of "
+        f"{thick:.2g} mm. If the object reaches so far, its free surfaces are not where the model has them, and moduli, the law or the "
+        "readings of its vectors are blamed for that: make the mask larger.",
     )
 
 

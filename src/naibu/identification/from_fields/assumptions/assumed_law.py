@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from naibu.identification.from_fields.assumptions.other_assumptions import holds
 from naibu.identification.from_fields.forward.load_cases import KNOWN, Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, young_and_poisson
 from naibu.identification.from_fields.uncertainty import EXACT, LawPart, Uncertainty, by_law, intervals
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import Verdict
 from naibu.mechanics.finite_elements.elements import elements
 
 LEAST_STRAIN = 0.02  # equivalent strain, root mean square, below which forms of the law change stress by 2 per cent at most
@@ -84,8 +83,7 @@ def judged(
     """
     against = _against(free, zones, theta, elements_known=elements_known)
     if against:
-        part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
-        judged = replace(judged, explanation=part, reasons=(against, *judged.reasons))
+        judged = judged.in_part(against)
     return judged, hangs_on_law(judged, free, total, theta)
 
 

@@ -2,19 +2,21 @@
 
 Averages over a neighbourhood blunt how strain changes from one zone to the next, so that small zones come out too much like what lies
 around them. The noise is averaged in the same way, and neighbouring points then share it: noise of independent points that a Gaussian
-kernel of standard deviation s averages has the correlation ``exp(-d^2 / 4 s^2)`` at a distance d. From that of the residuals s is found,
-and, to first order, what moduli would be if the model's displacement were averaged as well. Errors of a model are shared by neighbours,
-too: how much of such averages the field asks for is found by a score test
+kernel of standard deviation s averages has the correlation ``exp(-d^2 / 4 s^2)`` at a distance d. From that of the residuals s is found.
+Errors of a model are shared by neighbours, too: how much of such averages the field asks for is found by a score test
 (`naibu.identification.from_fields.assumptions.score_test`), of points whose kernels lie inside of the body: how averages were made at its
-surface is not known.
+surface is not known. What moduli would be is found by fits of the averaged displacement of the model; a fit follows some of what neighbours
+share, so that s is too small, and longer kernels are tried as well: that of the least misfit counts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy.sparse as sp
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
@@ -22,10 +24,11 @@ from naibu.identification.from_fields.assumptions.assumed_law import told_change
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
-from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import Linearised, young_and_poisson
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, fitted_near
 from naibu.identification.from_fields.verdicts.verdict import WITHIN_NOISE
 from naibu.identification.neighbours import neighbours
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import Verdict
 from naibu.meshing.point_location import locate, operator_of
 
 NEIGHBOURS = 124  # those of a point of a grid within two steps along each axis
@@ -33,6 +36,7 @@ AVERAGED = 0.5  # of the square of the residuals, that must be shared as average
 SHORTEST, LONGEST, LENGTHS = 0.25, 3.0, 40  # standard deviations of kernels that are tried, in distances to the nearest point
 FEWEST_POINTS = 100
 ALLOWED, LEAST = 2.0, 0.25  # standard errors beyond what the field asks for, and what of averages it must allow then
+LONGER, TRIED = 1.25, 4  # each kernel that is tried over the one before, and how many are
 WITHIN = 1e-6  # mm
 NODE = np.sqrt(3.0)  # distance of the nodes of a cubature of the third degree from its centre, standard deviations of a normal density
 WEIGHT = 1.0 / 6.0  # of each of them
@@ -63,7 +67,7 @@ class Averaging:
     theta: FloatArray
 
 
-def averaging(test: ScoreTest, residuals: Sequence[FloatArray], stretch: FloatArray) -> Averaging | None:
+def averaging(test: ScoreTest, residuals: Sequence[FloatArray], stretch: FloatArray, bounds: Bounds) -> Averaging | None:
     """Return what averages would mean for the moduli; None where residuals do not look like that.
 
     Parameters
@@ -74,6 +78,8 @@ def averaging(test: ScoreTest, residuals: Sequence[FloatArray], stretch: FloatAr
         The best whitened residuals that are known.
     stretch : ndarray, shape (2 count,)
         By how much changes of logarithms are larger at vanishing element size.
+    bounds : Bounds
+        Of the moduli.
     """
     at, model = test.at, test.at.model
     if model.mesh.dimension != 3:
@@ -89,7 +95,8 @@ def averaging(test: ScoreTest, residuals: Sequence[FloatArray], stretch: FloatAr
     square = max(one.points * float((r**2).mean()) for one, r in zip(kernels, residuals, strict=True))
     if asked.part + ALLOWED * float(np.sqrt(square / asked.size)) < LEAST:
         return None
-    return Averaging(max(one.length_mm for one in kernels), stretch * asked.theta)
+    times, theta = _fitted(at, [one.length_mm for one in kernels], bounds)
+    return Averaging(times * max(one.length_mm for one in kernels), stretch * (asked.theta if theta is None else theta))
 
 
 def kernel(points: FloatArray, residual: FloatArray) -> Kernel:
@@ -118,13 +125,46 @@ def judged_averages(judged: Verdict, found: Averaging | None, zones: Zones, thet
     changes = told_changes(zones, np.log(young_and_poisson(theta + found.theta)[0] / young_and_poisson(theta)[0]))
     if not changes:
         return judged
-    part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
     why = (
         f"{AVERAGES} (smoothed, interpolated, or from large windows; a standard deviation of some {found.length_mm:.2g} mm): "
         f"if they are, Young's modulus would be another one: {changes}"
     )
-    first = judged.noise_factor <= WITHIN_NOISE
-    return replace(judged, explanation=part, reasons=(why, *judged.reasons) if first else (*judged.reasons, why))
+    return judged.in_part(why, first=judged.noise_factor <= WITHIN_NOISE)
+
+
+def _fitted(at: Linearised, lengths: Sequence[float], bounds: Bounds) -> tuple[float, FloatArray | None]:
+    """Return how many times as long kernels of averages fit best, and the change (2 count,) of theta then, None without equilibrium.
+
+    Lengths are standard deviations for every load case, mm, 0 for none.
+    """
+    model, least = at.model, np.inf
+    best: tuple[float, FloatArray | None] = (1.0, None)
+    for times in LONGER ** np.arange(TRIED):
+        averaged = copy(model)
+        averaged.observed = tuple(_averaged(model.computed, o, times * s) for o, s in zip(model.observed, lengths, strict=True))
+        averaged.boundary = model.boundary.copied()
+        found = fitted_near(averaged, at.point.theta, at.point.states, bounds)
+        if found is not None and found.misfit < least:
+            best, least = (float(times), found.theta - at.point.theta), found.misfit
+    return best
+
+
+def _averaged(mesh: Mesh, o: Observed, length: float) -> Observed:
+    """Return measurements that are averages of the model's displacement over a kernel."""
+    if length == 0.0:
+        return o
+    average = sp.csr_array((len(o.points), mesh.n_points))
+    for step in _steps(length):
+        average = average + WEIGHT * operator_of(mesh, locate(mesh, o.points + step, tolerance_mm=np.inf))
+    whiten, d = whitening(o.load_case.field, o.load_case.name)[0], o.points.shape[1]
+    blocks = np.arange(len(whiten) + 1)
+    operator = (sp.bsr_matrix((whiten, blocks[:-1], blocks)).tocsr() @ sp.kron(average, sp.identity(d), format="csr")).tocsr()
+    return replace(o, operator=operator, information=(operator.T @ operator).tocsr())
+
+
+def _steps(length: float) -> FloatArray:
+    """Return the nodes (6, 3), mm, of the cubature of the third degree for a normal density of a standard deviation, mm."""
+    return np.asarray(NODE * length * np.concatenate([np.eye(3), -np.eye(3)]))
 
 
 def _blunted(mesh: Mesh, o: Observed, u: FloatArray, length: float) -> tuple[FloatArray, BoolArray]:
@@ -136,7 +176,7 @@ def _blunted(mesh: Mesh, o: Observed, u: FloatArray, length: float) -> tuple[Flo
     change, inside = np.zeros_like(points), np.full(len(points), length > 0.0)
     if length > 0.0:
         own = operator_of(mesh, locate(mesh, points, tolerance_mm=np.inf)) @ u
-        for step in NODE * length * np.concatenate([np.eye(3), -np.eye(3)]):
+        for step in _steps(length):
             there = locate(mesh, points + step, tolerance_mm=np.inf)
             change += WEIGHT * (operator_of(mesh, there) @ u - own)
             inside &= there.distance_mm <= WITHIN

@@ -22,6 +22,7 @@ from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point, moduli_of
 from naibu.identification.from_fields.forward.shaped_law import N_SHAPES, ShapedLaw
+from naibu.identification.from_fields.inversion.told_combinations import bounded_covariance
 from naibu.identification.from_fields.verdicts.verdict import inflation
 
 SHAPE_SD = (0.5, 1.0, 1.0, 1.0)  # of c01, c20, c30 as in identification from markers; of the isochoric part, which is none or all
@@ -274,7 +275,7 @@ class _Joint:
         added = -self.posterior(search) @ slope
         all_of_it = np.concatenate([[1.0], added])
         theta, motion = _within(self.there.point.theta, self.follow @ all_of_it), [m @ all_of_it for m in self.motion]
-        sd = np.sqrt(np.diag(np.linalg.pinv(self.quadratic.hessian) * self.variance + self.of_moduli(search)))
+        sd = np.sqrt(np.diag(bounded_covariance(self.quadratic.hessian / self.variance) + self.of_moduli(search)))
         return _Step(theta, added, motion, float(np.max(np.abs(theta) / np.maximum(sd, 1e-300))))
 
     def probability(self, search: _Search, kinds: tuple[int, ...]) -> float:

@@ -9,7 +9,7 @@ better (`naibu.identification.from_fields.assumptions.score_test`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtrc
@@ -22,7 +22,7 @@ from naibu.identification.from_fields.assumptions.other_assumptions import chang
 from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import moduli_of, young_and_poisson
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import Verdict
 from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 
 STATED_SD = 2.0  # stated standard deviations of a ratio within which another one is no contradiction
@@ -104,8 +104,7 @@ def judged_ratios(judged: Verdict, found: Sequence[AskedRatio], zones: Zones, th
             f"fields ask for some {one.asked:.2g} instead of {one.stated:.3g} of {one.region!r}, with which Young's modulus of "
             f"{zones.names[i]} would be {much}"
         )
-    part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
-    return replace(judged, explanation=part, reasons=(f"{DOES_NOT_FIT}: {'; '.join(each)}", *judged.reasons))
+    return judged.in_part(f"{DOES_NOT_FIT}: {'; '.join(each)}")
 
 
 def doubt_of_ratios(found: Sequence[AskedRatio], size: int) -> FloatArray:

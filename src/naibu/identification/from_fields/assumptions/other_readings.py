@@ -17,7 +17,6 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.core.progress import report_progress
 from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, LEAST_STRAIN, largest_strain, told_changes
@@ -25,17 +24,17 @@ from naibu.identification.from_fields.assumptions.volume_change import mean_grad
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, young_and_poisson
-from naibu.identification.from_fields.inversion.gauss_newton import Bounds, Objective, SearchSettings, first_point, search
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.from_fields.inversion.gauss_newton import Bounds, fitted_near
+from naibu.identification.verdict import Verdict
 from naibu.meshing.point_location import locate
 
 DECISIVE = 25.0  # of twice the logarithm of a ratio of likelihoods: five standard deviations of a normal score
 ALIKE = 36.0  # the same of readings that may be right as well: what another law explains is only known roughly
+LEAST_PART = 0.1  # of what is left beyond noise, that a likelier reading must explain: errors of cells look like less of it
 PROBES = 32  # random signs that estimate how much of the noise a surface follows: of a thousand components to one hundredth
 REVERSED, PLACED_LATER = "all displacements reversed", "displacements that stand where points came to lie"
 EXCHANGED = "the reference and the deformed scan exchanged"
 READINGS = {REVERSED: (0.0, -1.0), PLACED_LATER: (-1.0, 1.0), EXCHANGED: (1.0, -1.0)}  # vectors that are added to points, and their sign
-ROUGHLY = SearchSettings(max_iterations=10, tolerance=1e-3)
 MOST_LOST = 0.4  # of the points, that another reading may put outside of the body: where it puts more there it is none
 ON_SURFACE = 1e-6  # mm
 CHECK = (
@@ -56,11 +55,19 @@ class Reading:
     gain : float
         Twice the logarithm of its likelihood over that of the fields as they are, or of small strain or another law if that is more: a
         field that was computed at small strain lies half-way to the reversed one.
+    part : float
+        Of what these leave beyond noise, that it explains.
     """
 
     text: str
     theta: FloatArray
     gain: float
+    part: float = 1.0
+
+    @property
+    def likelier(self) -> bool:
+        """Whether the reading fits far better than the fields as they are."""
+        return self.gain > DECISIVE and self.part >= LEAST_PART
 
 
 def other_readings(model: FieldModel, best: Point, of_law: float, variance: float, bounds: Bounds) -> tuple[Reading, ...]:
@@ -72,7 +79,7 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
     best : Point
         The best fit of the fields as they are.
     of_law : float
-        By how much chi squared falls with the shape of the law free.
+        By how much chi squared falls with the shape of the law free, or with a border that slides.
     variance : float
         Of whitened residuals over that stated, errors that neighbours share counted.
     bounds : Bounds
@@ -80,7 +87,7 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
     """
     if model.law.linear or largest_strain(model, best.states) < LEAST_STRAIN:
         return ()
-    small = _fitted(model.with_law("linear"), best.theta, best.states, bounds)
+    small = fitted_near(model.with_law("linear"), best.theta, best.states, bounds)
     otherwise = 0.0 if small is None else small.misfit - best.misfit
     other_law, out = min(0.0, otherwise, -of_law), []
     before = _excess(model, best)
@@ -90,18 +97,21 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
         if any(kept.mean() < 1.0 - MOST_LOST for _, kept in moved):
             continue
         other = _measured_as(model, [field for field, _ in moved])
-        found = _fitted(other, best.theta, [sign * u for u in best.states], bounds)
+        found = fitted_near(other, best.theta, [sign * u for u in best.states], bounds)
         if found is None:
             continue
         as_it_is = before if shift == 0.0 else _excess(model, best, [kept for _, kept in moved])
-        out.append(Reading(text, found.theta - best.theta, (as_it_is + other_law - _excess(other, found)) / variance))
+        left = as_it_is + other_law
+        fall = left - _excess(other, found)
+        out.append(Reading(text, found.theta - best.theta, fall / variance, fall / max(left, abs(fall), 1e-300)))
     return tuple(out)
 
 
 def likelier(found: Sequence[Reading]) -> tuple[Reading, ...]:
     """Return the readings that fit far better than the fields as they are, and about as well as the best of them, the best first."""
-    best = max((one.gain for one in found), default=0.0)
-    return tuple(sorted((one for one in found if one.gain > max(DECISIVE, best - DECISIVE)), key=lambda one: -one.gain))
+    better = [one for one in found if one.likelier]
+    best = max((one.gain for one in better), default=0.0)
+    return tuple(sorted((one for one in better if one.gain > best - DECISIVE), key=lambda one: -one.gain))
 
 
 def covariance_of_readings(found: Sequence[Reading], size: int) -> FloatArray:
@@ -111,27 +121,18 @@ def covariance_of_readings(found: Sequence[Reading], size: int) -> FloatArray:
 
 def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, theta: FloatArray) -> Verdict:
     """Return the verdict with the readings that fit far better than the fields as they are first, and in a note those that fit as well."""
-    alike = [one.text for one in found if -ALIKE <= one.gain <= DECISIVE]
+    alike = [one.text for one in found if one.gain >= -ALIKE and not one.likelier]
     if alike:
         told = f"The fields would fit as well with {' or '.join(alike)}: that they are neither is taken for given."
         judged = replace(judged, notes=(*judged.notes, told.replace("neither", "not") if len(alike) == 1 else told))
     better = likelier(found)
     if not better:
         return judged
-    part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
     texts = " or ".join(f"{one.text} (chi squared falls by {one.gain:.3g})" for one in better)
     changes = told_changes(zones, np.log(young_and_poisson(theta + better[0].theta)[0] / young_and_poisson(theta)[0]))
     why = CHECK.format(texts, f", which would make Young's modulus another one ({changes})" if changes else "")
     reasons = (reason for reason in judged.reasons if not reason.startswith(DOES_NOT_FIT))  # this explains more than another law
-    return replace(judged, explanation=part, reasons=(why, *reasons))
-
-
-def _fitted(model: FieldModel, theta: FloatArray, near: Sequence[FloatArray], bounds: Bounds) -> Point | None:
-    """Return the best fit from some moduli and a motion near by; None where no equilibrium is found."""
-    try:
-        return search(model, _start(model, theta, near), Objective(bounds=bounds), ROUGHLY, progress=model.progress).point
-    except ConvergenceError:
-        return None
+    return replace(judged, reasons=tuple(reasons)).in_part(why)
 
 
 def _excess(model: FieldModel, point: Point, kept: Sequence[BoolArray] | None = None) -> float:
@@ -151,13 +152,6 @@ def _excess(model: FieldModel, point: Point, kept: Sequence[BoolArray] | None = 
         counted = (o.residual(point.states[t]) ** 2 - free).reshape(-1, o.load_case.field.points.shape[1])
         total += float(counted.sum() if kept is None else counted[kept[t]].sum())
     return total
-
-
-def _start(model: FieldModel, theta: FloatArray, near: Sequence[FloatArray]) -> Point:
-    try:
-        return model.evaluate(theta, near)
-    except ConvergenceError:
-        return first_point(model, theta)
 
 
 def _measured_as(model: FieldModel, fields: Sequence[DisplacementField]) -> FieldModel:

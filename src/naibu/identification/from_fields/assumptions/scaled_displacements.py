@@ -9,7 +9,7 @@ speaks for a growth that takes strain off it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.special import chdtrc
@@ -22,7 +22,7 @@ from naibu.identification.from_fields.forward.forward_model import Observed, whi
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
 from naibu.identification.from_fields.uncertainty import Uncertainty, intervals
-from naibu.identification.verdict import Explanation, Verdict
+from naibu.identification.verdict import Verdict
 from naibu.meshing.point_location import locate, operator_of
 
 AXES = "xyz"
@@ -84,32 +84,42 @@ def asked_scaling(test: ScoreTest, variance: float, stretch: FloatArray) -> Scal
     return best if len(AXES) * float(chdtrc(1, largest)) < UNLIKELY else None  # of the largest of so many by chance, at most
 
 
-def unless_law(found: Scaling | None, judged: Verdict, fall: float) -> Scaling | None:
-    """Return the growth; None where the verdict blames the law and chi squared falls with another one, by `fall`, at least as much."""
-    if found is None or (found.fall <= fall and any(reason.startswith(DOES_NOT_FIT) for reason in judged.reasons)):
+def unless_explained(found: Scaling | None, judged: Verdict, of_law: float, of_sliding: float) -> Scaling | None:
+    """Return the growth; None where chi squared falls as much with another law, which the verdict blames, or with a border that slides.
+
+    It falls by `of_law` and `of_sliding`.
+    """
+    if found is None or found.fall <= of_sliding:
         return None
-    return found
+    return None if found.fall <= of_law and any(reason.startswith(DOES_NOT_FIT) for reason in judged.reasons) else found
 
 
 def judged_scaling(
-    judged: Verdict, found: Scaling | None, zones: Zones, theta: FloatArray, total: Uncertainty, explained: float
+    judged: Verdict,
+    found: Scaling | None,
+    zones: Zones,
+    theta: FloatArray,
+    total: Uncertainty,
+    explained: float,
+    *,
+    coarse: bool = False,
 ) -> Verdict:
     """Return the verdict with a growth of displacements, where moduli would change by much or leave their intervals without it.
 
-    It is the first reason where chi squared falls with it by more than `explained`, the last one otherwise.
+    It is the first reason where chi squared falls with it by more than `explained`, the last one otherwise. Where elements are too `coarse`
+    for what half their size changes to be their error, it is none: bones of few cells across looked like a growth by a half.
     """
-    if found is None:
+    if found is None or coarse:
         return judged
     changes = _told(found, zones, theta, total)
     if not changes:
         return judged
-    part = Explanation.IN_PART if judged.explanation is Explanation.EXPLAINED else judged.explanation
     along = f"along {AXES[found.axis]}"
     why = (
         f"displacements {'grow' if found.growth > 0.0 else 'shrink'} by {100.0 * abs(found.growth):.2g} % {along} beyond what moduli "
         f"explain, {SCALED}, or where the scale of displacements or the stiffness within a zone changes {along}: without that, {changes}"
     )
-    return replace(judged, explanation=part, reasons=(why, *judged.reasons) if found.fall > explained else (*judged.reasons, why))
+    return judged.in_part(why, first=found.fall > explained)
 
 
 def _told(found: Scaling, zones: Zones, theta: FloatArray, total: Uncertainty) -> str:

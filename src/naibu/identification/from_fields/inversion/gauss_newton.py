@@ -6,7 +6,7 @@ minimised, weighted by the covariance of the measurement.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 
@@ -354,3 +354,16 @@ def _line_search(at: Linearised, step: Step, objective: Objective, value: float)
             return found, new
         fraction *= 0.5
     return None
+
+
+def fitted_near(model: FieldModel, theta: FloatArray, near: Sequence[FloatArray], bounds: Bounds) -> Point | None:
+    """Return about the best fit from some moduli (2 count,) and a motion (n, d), mm, near by; None where no equilibrium is found."""
+    try:
+        try:
+            start = model.evaluate(theta, near)
+        except ConvergenceError:
+            start = first_point(model, theta)
+        roughly = SearchSettings(max_iterations=10, tolerance=1e-3)
+        return search(model, start, Objective(bounds=bounds), roughly, progress=model.progress).point
+    except ConvergenceError:
+        return None

@@ -18,3 +18,9 @@ def told(information: FloatArray) -> tuple[FloatArray, FloatArray]:
     values, vectors = np.linalg.eigh(information)
     kept = values > LEAST_INFORMATION
     return values[kept], vectors[:, kept]
+
+
+def bounded_covariance(information: FloatArray) -> FloatArray:
+    """Return the inverse of information (k, k) on logarithms, which rounding may leave below 0, as if it gave bounds at least."""
+    values, vectors = np.linalg.eigh(information)
+    return np.asarray(vectors / np.maximum(values, LEAST_INFORMATION) @ vectors.T)

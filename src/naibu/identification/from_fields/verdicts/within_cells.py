@@ -14,7 +14,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
-from naibu.identification.from_fields.mesh_error import relative_change
+from naibu.identification.from_fields.mesh_error import relative_change, weight_of_change
 from naibu.identification.from_fields.uncertainty import Uncertainty, young_and_poisson_slopes
 from naibu.identification.from_fields.verdicts.verdict import SHARED
 from naibu.identification.verdict import UNDETERMINED, Explanation, Verdict
@@ -56,6 +56,12 @@ class HalfSize:
         return np.stack([np.log(young / before), *relative_change(self.theta - self.fitted).reshape(2, -1)])
 
     @property
+    def weighed(self) -> FloatArray:
+        """The same, that of mu / kappa as much as it tells of too large elements (`mesh_error.weight_of_change`)."""
+        of_ratio = weight_of_change(self.fitted).reshape(2, -1)[1]
+        return np.asarray(self.changes * np.stack([np.ones_like(of_ratio), np.ones_like(of_ratio), of_ratio]))
+
+    @property
     def standard_deviations(self) -> FloatArray:
         """Those of the same numbers (3, count)."""
         return np.stack([self.of_noise.of_young_and_poisson(self.fitted)[0], *self.of_noise.standard_deviations().reshape(2, -1)])
@@ -92,10 +98,9 @@ def judged_within_cells(judged: Verdict, names: Sequence[str], half: HalfSize, s
         Zones whose moduli may be anything without taking the results of the others away, because the intervals of those hold it: they are
         named as not determined, and the verdict is in part at best. By default none.
     """
-    moves = np.abs(half.changes) > WITHIN
     sure = half.standard_deviations < DETERMINED
-    refused = moves & (sure | ~sure[0].any())
-    left_open = moves & ~refused
+    refused = (np.abs(half.weighed) > WITHIN) & (sure | ~sure[0].any())
+    left_open = (np.abs(half.changes) > WITHIN) & ~refused & ~sure
     notes = tuple(_told_open(name, np.flatnonzero(left_open[:, i]), half, i) for i, name in enumerate(names) if left_open[:, i].any())
     judged = replace(judged, notes=(*judged.notes, *notes))
     if not refused.any():
