@@ -21,7 +21,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, modulus_columns
+from naibu.identification.from_fields.forward.modulus_columns import modulus_columns
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of
 from naibu.identification.from_fields.inversion.told_combinations import told
 
 DRAWS = 16  # of motions
