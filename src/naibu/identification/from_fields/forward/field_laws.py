@@ -48,7 +48,7 @@ class FieldLaw(Protocol):
         ...
 
     def unit_works(self, u: FloatArray, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the work (m,) each, mN mm, of what small displacements add to `unit_forces` on others (both n d, r), all columns together."""
+        """Return the work (m,) each, mN mm, of what small displacements add to `unit_forces` on others (both n d, r), all columns."""
         ...
 
 
@@ -173,17 +173,26 @@ class NeoHookean:
         return of_lame, of_shear
 
     def unit_works(self, u: FloatArray, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the work (m,) each, mN mm, of what small displacements add to `unit_forces` on others (both n d, r), all columns together."""
+        """Return the work (m,) each, mN mm, of what small displacements add to `unit_forces` on others (both n d, r), all columns."""
         one, none, body = np.ones(len(self.cells)), np.zeros(len(self.cells)), self._body.apart
-        rows = (3 * self.cells[:, :, None] + np.arange(3)).ravel()
-        out = np.zeros((2, len(self.cells)))
-        for work, moduli in zip(out, ((one, none), (none, one)), strict=True):
-            blocks = body.with_parameters(self._body.table(*moduli)).evaluate(u[self.cells].reshape(-1, 3))[2]
-            tangent = body.pattern.matrix(blocks)
-            for a in range(0, along.shape[1], COLUMNS):
-                of_cells = against[rows, a : a + COLUMNS] * (tangent @ along[rows, a : a + COLUMNS])
-                work += of_cells.reshape(len(work), -1).sum(axis=1)
+        apart, out = u[self.cells].reshape(-1, 3), []
+        for moduli in ((one, none), (none, one)):
+            blocks = body.with_parameters(self._body.table(*moduli)).evaluate(apart)[2]
+            out.append(works_of_cells(body.pattern.matrix(blocks), self.cells, along, against))
         return out[0], out[1]
+
+
+def works_of_cells(tangent: sp.bsr_matrix, cells: IntArray, along: FloatArray, against: FloatArray) -> FloatArray:
+    """Return the work (m,), mN mm, of the forces along small displacements on others (both n d, r), all columns together.
+
+    The `tangent`, mN/mm, is that of all cells (m, k) with nodes of their own.
+    """
+    d = tangent.shape[0] // cells.size
+    rows, work = (d * cells[:, :, None] + np.arange(d)).ravel(), np.zeros(len(cells))
+    for a in range(0, along.shape[1], COLUMNS):
+        of_cells = against[rows, a : a + COLUMNS] * (tangent @ along[rows, a : a + COLUMNS])
+        work += of_cells.reshape(len(cells), -1).sum(axis=1)
+    return work
 
 
 def _works_of_linear(law: FieldLaw, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -386,8 +386,7 @@ class Linearised:
         is how these respond at a point near by. Systems of this point with equilibrium as a constraint tell the response at once.
         """
         self.renew_if_due(len(self.model.observed) * (basis.shape[1] + 1), tolerance)
-        found = self._with_equilibrium(basis, tolerance)
-        return self._by_gradients(basis, tolerance, near) if found is None else found
+        return self._with_equilibrium(basis, tolerance) or self._by_gradients(basis, tolerance, near)
 
     def _by_gradients(self, basis: FloatArray, tolerance: float, near: Sequence[FloatArray] | None) -> Concentrated:
         """Return what `concentrated` does, by conjugate gradients."""
@@ -395,7 +394,7 @@ class Linearised:
         pulls = [o.information @ u for o, u in zip(self.model.observed, moved, strict=True)]
         theta, loaded = self.gradient()
         cross = self.adjoint(pulls)[1]
-        begin = None if near is None else [np.column_stack([x, np.zeros(len(x))]) for x in near]
+        begin = near and [np.column_stack([x, np.zeros(len(x))]) for x in near]
         solved = self._loaded_solved([np.column_stack([c, g]) for c, g in zip(cross, loaded, strict=True)], tolerance, begin)
         response, offset = [x[:, :-1] for x in solved.solution], [x[:, -1] for x in solved.solution]
         # with the inverse A^-1 and the residual R = C - A X of a solution X: C' A^-1 C = C' X + X' R + R' A^-1 R
@@ -409,10 +408,9 @@ class Linearised:
         """Return what `concentrated` does, by the systems of this point; None where there are none, or they are not exact."""
         made = [self.boundary(t) for t in range(len(self.columns))]
         own = [one.factor for t, one in enumerate(made) if one is self._own.get(t) and isinstance(one.factor, WithEquilibrium)]
-        if len(own) < len(made):
-            return None
-        parts = [f.followed(o, c @ basis) for f, o, c in zip(own, self.model.observed, self.columns, strict=True)]
-        if None in parts:
+        found = [f.followed(o, c @ basis) for f, o, c in zip(own, self.model.observed, self.columns, strict=len(own) == len(made))]
+        parts = [part for part in found if part is not None]
+        if len(parts) < len(made):
             return None
         theta, loaded = self.gradient()
         offset = [x[:, 0] for x in self._loaded_solved([g[:, None] for g in loaded], tolerance).solution]
