@@ -32,6 +32,7 @@ EXACT = 1e-3  # standard deviation ascribed to data that are called exact, as a 
 SURFACE_STRAIN = 0.2  # standard deviation of the strain along loaded nodes: constrains those near which nothing was measured
 NEWTON_TOLERANCE = 1e-9  # residual force over the force on the loaded nodes
 NEWTON_ITERATIONS = 12
+KEPT_TOLERANCE = 1e-12  # the same with the tangent of an earlier point, whose last step gains a factor, and not that error squared
 KEPT_SERVES = 0.3  # of what is unbalanced, that a solution with the tangent of an earlier point may leave
 PATIENT_ITERATIONS = 30  # from a displacement that larger cells lend
 LONG_WAY = 30_000  # unknowns up to which equilibrium is sought from rest as well: twenty factorizations or more, minutes beyond
@@ -264,7 +265,7 @@ def _nearer(
     if kept is None:
         return guess
     u, (residual, norm) = guess, _unbalanced(load_case, law.forces(lame, shear, guess))
-    while np.isfinite(norm) and norm > NEWTON_TOLERANCE:
+    while np.isfinite(norm) and norm > KEPT_TOLERANCE:
         step = np.where(load_case.loaded, 0.0, kept.solve(residual.ravel()).reshape(u.shape))
         residual, new = _unbalanced(load_case, law.forces(lame, shear, u - step))
         if not new < KEPT_SERVES * norm:
