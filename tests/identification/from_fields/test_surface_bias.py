@@ -12,12 +12,13 @@ from gel_under_a_plate import GEL_KPA, gel_under_a_plate
 from naibu.core.arrays import FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.identification.from_fields.estimate import identify_field
-from naibu.identification.from_fields.forward.field_laws import LawName
+from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.forward.loaded_components import BoundaryPreconditioner
 from naibu.identification.from_fields.forward.sensitivities import FieldModel
 from naibu.identification.from_fields.inversion.gauss_newton import Objective, first_point, search
 from naibu.identification.from_fields.surface.bias import slope_of_informed
+from naibu.identification.from_fields.surface.noise import tangent_columns, works_of_moduli
 
 
 def test_what_the_prior_takes_off_the_strain_at_the_surface_is_not_made_up_for_by_the_moduli() -> None:
@@ -77,6 +78,16 @@ def test_the_slope_of_what_measurements_determine_is_its_difference(law: LawName
     step = 1e-3 * np.eye(2)
     difference = [(informed(TRUTH + e) - informed(TRUTH - e)) / 2e-3 for e in step]
     np.testing.assert_allclose(slope, difference, atol=0.05)  # random signs
+
+
+@pytest.mark.parametrize(("law", "elements"), [("linear", "as_given"), ("linear", "accurate"), ("neo_hookean", "accurate")])
+def test_works_of_changes_of_moduli_are_products_of_their_forces(law: LawName, elements: FieldElements) -> None:
+    mesh, zones, load_case = gel_on_a_pad()
+    model = FieldModel(mesh, [load_case], zones, law, elements)
+    at, rng = model.linearised(first_point(model, TRUTH)), np.random.default_rng(4)
+    along, against = rng.standard_normal((2, model.points.size, 10))
+    expected = sum(tangent_columns(at, 0, along[:, k]).T @ against[:, k] for k in range(10))
+    np.testing.assert_allclose(works_of_moduli(at, 0, along, against), expected, rtol=1e-5)
 
 
 @pytest.mark.filterwarnings("error")

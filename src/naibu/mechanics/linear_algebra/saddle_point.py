@@ -48,12 +48,14 @@ class SaddlePoint:
         self._scale, self._m = scale, m
         self._factor = _QuasiDefinite(shifted).factorize(shifted)
 
-    def solve(self, b: FloatArray) -> FloatArray:
-        """Return x for b of shape (n,) or (n, r)."""
+    def solve(self, b: FloatArray, c: FloatArray | None = None) -> FloatArray:
+        """Return x for b of shape (n,) or (n, r); under ``C x = c`` with c of shape (m,) or (m, r) where it is given."""
         right = np.zeros((self._n + self._m, *b.shape[1:]))
-        scale = self._scale[: self._n].reshape(-1, *[1] * (b.ndim - 1))
-        right[: self._n] = scale * b
-        return np.asarray(scale * self._factor.solve(right)[: self._n])
+        scale = self._scale.reshape(-1, *[1] * (b.ndim - 1))
+        right[: self._n] = scale[: self._n] * b
+        if c is not None:
+            right[self._n :] = scale[self._n :] * c
+        return np.asarray(scale[: self._n] * self._factor.solve(right)[: self._n])
 
 
 class _QuasiDefinite(PardisoSolver):

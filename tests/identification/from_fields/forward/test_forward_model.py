@@ -33,3 +33,28 @@ def test_where_there_is_no_equilibrium_it_is_not_sought_at_length(monkeypatch: p
     with pytest.raises(ConvergenceError):
         forward_model.settled(law, forward_model.Solvers(law, mesh.points), mesh.points, lame, shear, case, pushed)
     assert not tried
+
+
+def test_the_tangent_of_a_point_near_by_leads_to_the_same_equilibrium_with_one_factorization(monkeypatch: pytest.MonkeyPatch) -> None:
+    """And none where moduli and displacement are those of the point before."""
+    mesh = box([40.0] * 3, [4] * 3, centred=False)
+    law = field_law(mesh, "neo_hookean", averaged=True)
+    lame, shear = (np.full(mesh.n_cells, value) for value in lame_parameters(10.0, 0.45))
+    top = mesh.points[:, 2] > 39.0
+    pushed = mesh.points[:, 2:] / 40.0 * [1.0, 0.0, -4.0]
+    field = DisplacementField.from_arrays(mesh.points, pushed, sd_mm=0.1)
+    case = FieldLoadCase.of("push", field, mesh, loaded=top | (mesh.points[:, 2] < 1.0))
+    solvers, made = forward_model.Solvers(law, mesh.points), []
+    anew = solvers._anew
+    monkeypatch.setattr(solvers, "_anew", lambda *given: made.append(1) or anew(*given))
+    u, _ = forward_model.equilibrium(law, solvers, lame, shear, case, pushed, b"")
+    made.clear()
+    forward_model.equilibrium(law, solvers, lame, shear, case, u, b"")
+    assert not made
+    stiffer = np.where(mesh.points[mesh.cells].mean(axis=1)[:, 0] > 20.0, 1.1, 1.0)
+    near, factor = forward_model.equilibrium(law, solvers, stiffer * lame, stiffer * shear, case, u, b"")
+    assert len(made) == 1
+    other = forward_model.Solvers(law, mesh.points)
+    expected, tangent = forward_model.equilibrium(law, other, stiffer * lame, stiffer * shear, case, u, b"")
+    np.testing.assert_allclose(near, expected, atol=1e-8)
+    np.testing.assert_allclose(factor.solve(u.ravel()), tangent.solve(u.ravel()), rtol=1e-6, atol=1e-9)

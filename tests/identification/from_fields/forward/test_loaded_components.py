@@ -91,3 +91,26 @@ def test_iterations_end_where_a_new_preconditioner_costs_less() -> None:
     np.testing.assert_allclose(whole.solution[0], right[0] / diagonal, atol=1e-4)
     assert not ended.complete
     assert ended.iterations < 20
+
+
+@pytest.mark.skipif(pardiso_library() is None, reason="oneMKL is not installed")
+@pytest.mark.parametrize("cell_type", ["hexahedron", "tetra"])
+def test_a_system_of_this_point_tells_the_quadratic_in_moduli_that_conjugate_gradients_tell(
+    cell_type: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And that the response to every component tells; the body is bent, so that moduli matter."""
+    still = beside_a_plate(cell_type)
+    bent = 0.01 * still.model.points[:, [2, 0, 1]] ** 2 / 30.0
+    at = still.model.linearised(still.model.evaluate(still.point.theta, [bent]))
+    expected = at.concentrated(np.eye(2))
+    monkeypatch.setattr(loaded_components, "DENSE", 0)
+    at.model.boundary.forget()
+    by_gradients = at._by_gradients(np.eye(2), 1e-9, None)
+    monkeypatch.setattr(Linearised, "_by_gradients", None)
+    found = at.concentrated(np.eye(2))
+    scale = np.sqrt(np.diag(expected.hessian))
+    for other in (expected, by_gradients):
+        np.testing.assert_allclose(found.hessian / np.outer(scale, scale), other.hessian / np.outer(scale, scale), atol=1e-6)
+        np.testing.assert_allclose(found.gradient / scale, other.gradient / scale, atol=1e-5 * np.abs(expected.gradient / scale).max())
+        np.testing.assert_allclose(found.response[0], other.response[0], atol=1e-4 * np.abs(expected.response[0]).max())
+        np.testing.assert_allclose(found.offset[0], other.offset[0], atol=1e-4 * np.abs(expected.offset[0]).max())

@@ -49,6 +49,11 @@ def test_tangent_unit_forces_and_slopes_by_shapes_are_those_of_forces(cell_type:
     summed = np.zeros_like(u)
     np.add.at(summed, law.cells, lame[:, None, None] * of_lame + shear[:, None, None] * of_shear)
     np.testing.assert_allclose(summed, law.forces(lame, shear, u), atol=1e-9 * np.abs(summed).max())
+    ahead, behind = (law.unit_forces(u + side * 1e-5 * d) for side in (1.0, -1.0))
+    works = law.unit_works(u, d.reshape(-1, 1), u.reshape(-1, 1))
+    for work, plus, minus in zip(works, ahead, behind, strict=True):
+        expected = ((plus - minus) / 2e-5 * u[law.cells]).sum(axis=(1, 2))
+        np.testing.assert_allclose(work, expected, rtol=1e-5, atol=1e-5 * np.abs(expected).max())
     along = rng.normal(0.0, 1.0, (N_SHAPES, mesh.n_cells))
     there, here = law.with_shapes(SHAPES[:, upper] + along).forces(lame, shear, u), law.forces(lame, shear, u)
     np.testing.assert_allclose(law.forces_of_shape(lame, shear, u, along), there - here, atol=1e-9 * np.abs(here).max())

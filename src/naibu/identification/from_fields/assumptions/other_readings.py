@@ -90,7 +90,7 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
     small = fitted_near(model.with_law("linear"), best.theta, best.states, bounds)
     otherwise = 0.0 if small is None else small.misfit - best.misfit
     other_law, out = min(0.0, otherwise, -of_law), []
-    before = _excess(model, best)
+    before = _excess_of_points(model, best)
     for text, (shift, sign) in READINGS.items():
         report_progress(model.progress, f"comparing with {text}")
         moved = [_placed(model.mesh, o, u, shift, sign) for o, u in zip(model.observed, best.states, strict=True)]
@@ -100,9 +100,8 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
         found = fitted_near(other, best.theta, [sign * u for u in best.states], bounds)
         if found is None:
             continue
-        as_it_is = before if shift == 0.0 else _excess(model, best, [kept for _, kept in moved])
-        left = as_it_is + other_law
-        fall = left - _excess(other, found)
+        left = other_law + sum(float(excess[kept].sum()) for excess, (_, kept) in zip(before, moved, strict=True))
+        fall = left - sum(float(excess.sum()) for excess in _excess_of_points(other, found))
         out.append(Reading(text, found.theta - best.theta, fall / variance, fall / max(left, abs(fall), 1e-300)))
     return tuple(out)
 
@@ -135,8 +134,8 @@ def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, the
     return replace(judged, reasons=tuple(reasons)).in_part(why)
 
 
-def _excess(model: FieldModel, point: Point, kept: Sequence[BoolArray] | None = None) -> float:
-    """Return by how much chi squared exceeds what noise alone leaves, of some points (k,).
+def _excess_of_points(model: FieldModel, point: Point) -> list[FloatArray]:
+    """Return by how much chi squared of every point (k,) of the load cases exceeds what noise alone leaves.
 
     The surface follows some of the noise, the more the fewer points there are near it: by random signs (:cite:p:`bekas2007`). The weak
     prior on its motion says nothing of readings, which differ in strain.
@@ -146,12 +145,11 @@ def _excess(model: FieldModel, point: Point, kept: Sequence[BoolArray] | None = 
     signs = [rng.choice([-1.0, 1.0], size=(len(o.data), PROBES)) for o in model.observed]
     pulled = at.adjoint([o.operator.T @ z for o, z in zip(model.observed, signs, strict=True)])[1]
     moved = at.forward(None, at.loaded_solved(pulled))
-    total = 0.0
+    out = []
     for t, (o, u, z) in enumerate(zip(model.observed, moved, signs, strict=True)):
         free = ((z - np.asarray(o.operator @ u)) ** 2).mean(axis=1)
-        counted = (o.residual(point.states[t]) ** 2 - free).reshape(-1, o.load_case.field.points.shape[1])
-        total += float(counted.sum() if kept is None else counted[kept[t]].sum())
-    return total
+        out.append((o.residual(point.states[t]) ** 2 - free).reshape(-1, o.load_case.field.points.shape[1]).sum(axis=1))
+    return out
 
 
 def _measured_as(model: FieldModel, fields: Sequence[DisplacementField]) -> FieldModel:

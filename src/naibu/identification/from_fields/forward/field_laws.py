@@ -25,6 +25,7 @@ from naibu.meshing.element_conversion import to_quadratic
 
 LawName = Literal["linear", "neo_hookean"]
 FieldElements = Literal["accurate", "as_given"]
+COLUMNS = 8  # displacements of the nodes of all cells that are held at once
 
 
 class FieldLaw(Protocol):
@@ -44,6 +45,10 @@ class FieldLaw(Protocol):
 
     def unit_forces(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the forces at the nodes of every cell for lambda = 1 kPa and for mu = 1 kPa, (m, k, d) each, mN."""
+        ...
+
+    def unit_works(self, u: FloatArray, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the work (m,) each, mN mm, of what small displacements add to `unit_forces` on others (both n d, r), all columns."""
         ...
 
 
@@ -67,6 +72,10 @@ class SmallStrainSimplices:
     def unit_forces(self, u: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return the forces at the vertices of every cell for lambda = 1 kPa and for mu = 1 kPa, (m, d + 1, d) each, mN."""
         return parameter_forces(self.body.simplices, u)
+
+    def unit_works(self, u: FloatArray, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the work (m,) each, mN mm, of the `unit_forces` of displacements on others (both n d, r), all columns together."""
+        return _works_of_linear(self, along, against)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +137,10 @@ class SmallStrain:
         deviatoric = np.einsum("mq,mqij,mqaj->mai", weights, strain, gradients, optimize=True)
         return of_lame, deviatoric + 2.0 / 3.0 * of_lame
 
+    def unit_works(self, u: FloatArray, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the work (m,) each, mN mm, of the `unit_forces` of displacements on others (both n d, r), all columns together."""
+        return _works_of_linear(self, along, against)
+
 
 class NeoHookean:
     """Compressible neo-Hookean law ``W = mu (I1 - 3) / 2 - mu ln J + lambda (ln J)^2 / 2`` at finite strain."""
@@ -158,6 +171,37 @@ class NeoHookean:
         both = (self._body.apart.forces_of_parameter(apart, self._body.table(*moduli)) for moduli in ((one, none), (none, one)))
         of_lame, of_shear = (force.reshape(*self.cells.shape, 3) for force in both)
         return of_lame, of_shear
+
+    def unit_works(self, u: FloatArray, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the work (m,) each, mN mm, of what small displacements add to `unit_forces` on others (both n d, r), all columns."""
+        one, none, body = np.ones(len(self.cells)), np.zeros(len(self.cells)), self._body.apart
+        apart, out = u[self.cells].reshape(-1, 3), []
+        for moduli in ((one, none), (none, one)):
+            blocks = body.with_parameters(self._body.table(*moduli)).evaluate(apart)[2]
+            out.append(works_of_cells(body.pattern.matrix(blocks), self.cells, along, against))
+        return out[0], out[1]
+
+
+def works_of_cells(tangent: sp.bsr_matrix, cells: IntArray, along: FloatArray, against: FloatArray) -> FloatArray:
+    """Return the work (m,), mN mm, of the forces along small displacements on others (both n d, r), all columns together.
+
+    The `tangent`, mN/mm, is that of all cells (m, k) with nodes of their own.
+    """
+    d = tangent.shape[0] // cells.size
+    rows, work = (d * cells[:, :, None] + np.arange(d)).ravel(), np.zeros(len(cells))
+    for a in range(0, along.shape[1], COLUMNS):
+        of_cells = against[rows, a : a + COLUMNS] * (tangent @ along[rows, a : a + COLUMNS])
+        work += of_cells.reshape(len(cells), -1).sum(axis=1)
+    return work
+
+
+def _works_of_linear(law: FieldLaw, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return `unit_works` of a law whose forces are linear in displacements."""
+    out = np.zeros((2, len(law.cells)))
+    for a, b in zip(along.T, against.T, strict=True):
+        moved = b.reshape(law.n_points, -1)[law.cells]
+        out += [np.einsum("mki,mki->m", force, moved) for force in law.unit_forces(a.reshape(law.n_points, -1))]
+    return out[0], out[1]
 
 
 def field_law(mesh: Mesh, name: LawName, *, averaged: bool) -> FieldLaw:

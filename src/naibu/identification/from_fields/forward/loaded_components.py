@@ -11,7 +11,7 @@ import scipy.linalg as sl
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.progress import report_progress
 from naibu.identification.from_fields.forward.forward_model import Observed
@@ -142,20 +142,53 @@ def _of_responses(at: Linearised, t: int) -> _Cholesky:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _WithEquilibrium:
-    """The loaded components among the variables of a saddle-point system, the last n_b of n."""
+class WithEquilibrium:
+    """A saddle-point system of all displacements, equilibrium of the others than the loaded ones being a constraint.
+
+    Attributes
+    ----------
+    system : SaddlePoint
+        Of n variables: displacements of the others than the loaded components, then the n_b sought ones.
+    constraints : csr_matrix, shape (m, n)
+        Forces on the others, mN/mm.
+    every : csr_matrix, shape (n d, n)
+        From the variables to the displacement of all nodes.
+    others : ndarray, shape (m,), int64
+        Numbers of the others than the loaded components among the n d.
+    """
 
     system: SaddlePoint
-    n: int
+    constraints: sp.csr_matrix
+    every: sp.csr_matrix
+    others: IntArray
 
     def solve(self, b: FloatArray) -> FloatArray:
-        """Return the solution (n_b, r)."""
-        right = np.zeros((self.n, b.shape[1]))
-        right[self.n - len(b) :] = b
-        return self.system.solve(right)[self.n - len(b) :]
+        """Return the inverse of the Hessian of the sought displacements times b (n_b, r)."""
+        right = np.zeros((self.every.shape[1], b.shape[1]))
+        right[self.every.shape[1] - len(b) :] = b
+        return self.system.solve(right)[self.every.shape[1] - len(b) :]
+
+    def followed(self, o: Observed, force: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return the Hessian (r, r) of half the misfit in amounts of nodal forces (n d, r), mN, and how the sought displacements follow.
+
+        These (n_b, r), mm, with a minus sign, are those of least misfit; None where solutions are not in equilibrium. Errors of them change
+        the Hessian by their square.
+        """
+        right, n = -force[self.others], self.every.shape[1]
+        moved = np.empty((n, force.shape[1]), order="F")
+        for a in range(0, force.shape[1], BLOCK):
+            part = right[:, a : a + BLOCK]
+            moved[:, a : a + BLOCK] = self.system.solve(np.zeros((n, part.shape[1])), part)
+        signs = np.random.default_rng(3).choice([-1.0, 1.0], size=force.shape[1])
+        left = np.linalg.norm(self.constraints @ (moved @ signs) - right @ signs)
+        if not left <= BOUNDARY_TOLERANCE * np.linalg.norm(right @ signs):
+            return None
+        u, sought = self.every @ moved, moved[n - len(o.unknown) :]
+        hessian = u.T @ (o.information @ u) + sought.T @ (o.prior @ sought)
+        return 0.5 * (hessian + hessian.T), -sought
 
 
-def _with_equilibrium(o: Observed, stiffness: sp.bsr_matrix) -> _WithEquilibrium:
+def _with_equilibrium(o: Observed, stiffness: sp.bsr_matrix) -> WithEquilibrium:
     """Return the system in which all displacements are variables and equilibrium of the others than the loaded ones is a constraint.
 
     All its matrices have the pattern of the stiffness. It takes a fifth to a tenth of the time of the response to every loaded component.
@@ -166,8 +199,8 @@ def _with_equilibrium(o: Observed, stiffness: sp.bsr_matrix) -> _WithEquilibrium
     loaded = sp.csr_matrix((np.ones(len(o.loaded)), (o.loaded, np.arange(len(o.loaded)))), shape=(n, len(o.loaded)))
     every = sp.hstack([of_others, loaded @ o.basis]).tocsr()
     prior = sp.block_diag([sp.csr_matrix((len(others), len(others))), o.prior])
-    quadratic, constraints = every.T @ o.information @ every + prior, stiffness.tocsr()[others] @ every
-    return _WithEquilibrium(SaddlePoint(quadratic.tocsr(), constraints.tocsr()), every.shape[1])
+    quadratic, constraints = every.T @ o.information @ every + prior, (stiffness.tocsr()[others] @ every).tocsr()
+    return WithEquilibrium(SaddlePoint(quadratic.tocsr(), constraints), constraints, every, others)
 
 
 def local_preconditioner(o: Observed) -> Factorization:

@@ -23,7 +23,7 @@ from naibu.core.mesh import Mesh
 from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_fields.forward.field_laws import FieldElements, FieldLaw, LawName, computed_mesh, field_law
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, loaded_from_rest
-from naibu.identification.from_fields.forward.load_cases import KNOWN, FieldLoadCase, Zones, is_surface_sought
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones, is_surface_sought
 from naibu.identification.from_fields.forward.loaded_components import (
     AN_ITERATION,
     BOUNDARY_TOLERANCE,
@@ -32,11 +32,13 @@ from naibu.identification.from_fields.forward.loaded_components import (
     BoundaryPreconditioner,
     KeptPreconditioners,
     Solved,
+    WithEquilibrium,
     alike,
     conjugate_gradients,
     in_blocks,
     local_preconditioner,
 )
+from naibu.identification.from_fields.forward.modulus_columns import modulus_columns
 from naibu.identification.from_fields.forward.refinement import Refinement
 from naibu.mechanics.linear_algebra.protocols import Factorization
 
@@ -208,29 +210,6 @@ class FieldModel:
         return Linearised(self, point, columns, stiffness)
 
 
-def modulus_columns(law: FieldLaw, zones: Zones, lame: FloatArray, shear: FloatArray, u: FloatArray) -> sp.csc_matrix:
-    """Return the nodal forces (n d, 2 count), mN, of a relative change of mu at constant kappa / mu, then of kappa, of every zone."""
-    unit_lame, unit_shear = law.unit_forces(u)
-    _, k, d = unit_lame.shape
-    unknown = np.flatnonzero(zones.of_cell != KNOWN)
-    of_zone = unknown[np.argsort(zones.of_cell[unknown], kind="stable")]  # the cells of every zone, one zone after the other
-    cells = law.cells.astype(np.int32)  # fewer than 2^31 forces: 10^8 cells
-    if not np.array_equal(of_zone, np.arange(len(cells))):
-        lame, shear, unit_lame, unit_shear = (a[of_zone] for a in (lame, shear, unit_lame, unit_shear))
-        cells = cells[of_zone]
-    values, rows = np.empty((2, len(of_zone), k, d)), np.empty((2, len(of_zone), k, d), dtype=np.int32)
-    np.multiply(lame[:, None, None], unit_lame, out=values[0])
-    values[0] += shear[:, None, None] * unit_shear
-    np.multiply((lame + 2.0 / 3.0 * shear)[:, None, None], unit_lame, out=values[1])
-    rows[:] = d * cells[:, :, None] + np.arange(d, dtype=np.int32)
-    sizes = k * d * np.bincount(zones.of_cell[unknown], minlength=zones.count)
-    start = np.concatenate([[0], np.cumsum(np.tile(sizes, 2))]).astype(np.int32)
-    out = sp.csc_matrix((values.ravel(), rows.ravel(), start), shape=(law.n_points * d, 2 * zones.count))
-    if len(unknown) > zones.count:  # cells of a zone share nodes
-        out.sum_duplicates()
-    return out
-
-
 @dataclass(slots=True, eq=False)
 class Linearised:
     """The load cases' displacement as a linear function of changes of the unknowns, at one point of the search."""
@@ -243,6 +222,7 @@ class Linearised:
     _border: list[sp.csr_matrix] = field(default_factory=list)
     _gradient: Gradient | None = None
     _fresh: bool = False
+    _own: dict[int, BoundaryPreconditioner] = field(default_factory=dict)  # made of the tangents at this very point
     _products: int = 0
 
     def __post_init__(self) -> None:
@@ -346,6 +326,8 @@ class Linearised:
             found = BoundaryPreconditioner.of(self, t) if shared is None or twin is None else shared.scaled(self.model.observed, twin, t)
             kept.keep(t, found)
             self._fresh = True
+            if shared is None:
+                self._own[t] = found
         return found
 
     def loaded_solved(self, right: Sequence[FloatArray]) -> list[FloatArray]:
@@ -401,13 +383,18 @@ class Linearised:
         """Return half the misfit as a quadratic in changes of theta along `basis` (2 count, k), minimised over the loaded components.
 
         Hessian and gradient err by the square of what `tolerance`, a relative residual, leaves of the loaded components. `near` (n_b, k)
-        is how these respond at a point near by.
+        is how these respond at a point near by. Systems of this point with equilibrium as a constraint tell the response at once.
         """
+        self.renew_if_due(len(self.model.observed) * (basis.shape[1] + 1), tolerance)
+        return self._with_equilibrium(basis, tolerance) or self._by_gradients(basis, tolerance, near)
+
+    def _by_gradients(self, basis: FloatArray, tolerance: float, near: Sequence[FloatArray] | None) -> Concentrated:
+        """Return what `concentrated` does, by conjugate gradients."""
         moved = self.forward(basis, None)
         pulls = [o.information @ u for o, u in zip(self.model.observed, moved, strict=True)]
         theta, loaded = self.gradient()
         cross = self.adjoint(pulls)[1]
-        begin = None if near is None else [np.column_stack([x, np.zeros(len(x))]) for x in near]
+        begin = near and [np.column_stack([x, np.zeros(len(x))]) for x in near]
         solved = self._loaded_solved([np.column_stack([c, g]) for c, g in zip(cross, loaded, strict=True)], tolerance, begin)
         response, offset = [x[:, :-1] for x in solved.solution], [x[:, -1] for x in solved.solution]
         # with the inverse A^-1 and the residual R = C - A X of a solution X: C' A^-1 C = C' X + X' R + R' A^-1 R
@@ -416,6 +403,20 @@ class Linearised:
         hessian = sum(u.T @ p - c.T @ x - x.T @ r for u, p, c, x, r in parts)
         gradient = basis.T @ theta - sum(x.T @ g + r.T @ y for x, g, r, y in zip(response, loaded, left, offset, strict=True))
         return Concentrated(np.asarray(0.5 * (hessian + hessian.T)), np.asarray(gradient), response, offset)
+
+    def _with_equilibrium(self, basis: FloatArray, tolerance: float) -> Concentrated | None:
+        """Return what `concentrated` does, by the systems of this point; None where there are none, or they are not exact."""
+        made = [self.boundary(t) for t in range(len(self.columns))]
+        own = [one.factor for t, one in enumerate(made) if one is self._own.get(t) and isinstance(one.factor, WithEquilibrium)]
+        found = [f.followed(o, c @ basis) for f, o, c in zip(own, self.model.observed, self.columns, strict=len(own) == len(made))]
+        parts = [part for part in found if part is not None]
+        if len(parts) < len(made):
+            return None
+        theta, loaded = self.gradient()
+        offset = [x[:, 0] for x in self._loaded_solved([g[:, None] for g in loaded], tolerance).solution]
+        response = [x for _, x in parts]
+        gradient = basis.T @ theta - sum(x.T @ g for x, g in zip(response, loaded, strict=True))
+        return Concentrated(np.asarray(sum(h for h, _ in parts)), np.asarray(gradient), response, offset)
 
     def jacobians(self, quadratic: Concentrated) -> list[FloatArray]:
         """Return the derivatives (q, 2 count) of the whitened residuals of every load case, the loaded components following theta."""

@@ -16,6 +16,7 @@ import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
 from naibu.core.mesh import Mesh
+from naibu.identification.from_fields.forward.field_laws import works_of_cells
 from naibu.mechanics.finite_elements.assembly import Assembler
 from naibu.mechanics.finite_elements.elements import elements
 from naibu.mechanics.finite_elements.hyperelasticity import material
@@ -69,6 +70,15 @@ class ShapedLaw:
         for moduli in ((one, none), (none, one)):
             force = _sum(self._apart, _tables(*moduli, self.shapes, 1.0), lambda part: part.forces(apart)[1])
             out.append(force.reshape(*self.cells.shape, 3))
+        return out[0], out[1]
+
+    def unit_works(self, u: FloatArray, along: FloatArray, against: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the work (m,) each, mN mm, of what small displacements add to `unit_forces` on others (both n d, r), all columns."""
+        one, none = np.ones(len(self.cells)), np.zeros(len(self.cells))
+        apart, out = u[self.cells].reshape(-1, 3), []
+        for moduli in ((one, none), (none, one)):
+            blocks = _sum(self._apart, _tables(*moduli, self.shapes, 1.0), lambda part: part.evaluate(apart)[2])
+            out.append(works_of_cells(self._apart[0].pattern.matrix(blocks), self.cells, along, against))
         return out[0], out[1]
 
     def forces_of_shape(self, lame: FloatArray, shear: FloatArray, u: FloatArray, change: FloatArray) -> FloatArray:

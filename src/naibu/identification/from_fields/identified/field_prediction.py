@@ -23,8 +23,9 @@ from naibu.core.rigid_transform import registration
 from naibu.identification.from_fields.forward.field_laws import field_law
 from naibu.identification.from_fields.forward.forward_model import Solvers, equilibrium, loaded_from_rest
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
+from naibu.identification.from_fields.forward.modulus_columns import modulus_columns
 from naibu.identification.from_fields.forward.refinement import Refinement
-from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, modulus_columns
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.identified.sides import nodes_of_side
 from naibu.identification.from_fields.inversion.gauss_newton import first_point

@@ -367,12 +367,16 @@ def without_errors_of_cells(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Trial:
-    """Moduli (2 regions,), moves of borders (10 (regions - 1),) and states that go with them, and the objective there."""
+    """Moduli (2 regions,), moves of borders (10 (regions - 1),) and states that go with them, and the objective there.
+
+    The `response` is how loaded components follow them at a point near by, as in `Concentrated`, where that is known.
+    """
 
     theta: FloatArray
     moves: FloatArray
     point: Point
     value: float
+    response: list[FloatArray] | None = None
 
     @classmethod
     def at(cls, model: FieldModel, mixing: Mixing, theta: FloatArray, moves: FloatArray, states: Sequence[FloatArray]) -> _Trial:
@@ -389,7 +393,7 @@ def _stepped(model: FieldModel, mixing: Mixing, here: _Trial, bounds: Bounds) ->
     n, edge, objective, prior = len(here.theta), mixing.borders.edge_mm, Objective(bounds=bounds), _prior(mixing)
     slopes = mixing.moduli(here.theta, here.moves)[1]
     at = model.linearised(model.evaluate(here.point.theta, here.point.states))
-    quadratic = at.concentrated(slopes, ROUGH_TOLERANCE)
+    quadratic = at.concentrated(slopes, ROUGH_TOLERANCE, here.response)
     hessian, gradient = quadratic.hessian + prior.hessian(here.theta), quadratic.gradient + prior.gradient(here.theta, here.moves)
     free = np.concatenate([objective.free(here.theta, gradient[:n]), np.ones(len(gradient) - n, dtype=bool)])
     step = np.zeros_like(gradient)
@@ -404,7 +408,7 @@ def _stepped(model: FieldModel, mixing: Mixing, here: _Trial, bounds: Bounds) ->
         except ConvergenceError:
             continue
         if trial.value < here.value:
-            return trial
+            return replace(trial, response=quadratic.response)
     return None
 
 
@@ -412,7 +416,8 @@ def _with_covariance(model: FieldModel, mixing: Mixing, found: _Trial) -> Refine
     """Return what was found as regions, with the covariance of the moduli."""
     theta, moves, n = found.theta, found.moves, len(found.theta)
     point = model.evaluate(found.point.theta, found.point.states)
-    hessian = model.linearised(point).concentrated(mixing.moduli(theta, moves)[1], ROUGH_TOLERANCE).hessian + _prior(mixing).hessian(theta)
+    slopes = mixing.moduli(theta, moves)[1]
+    hessian = model.linearised(point).concentrated(slopes, ROUGH_TOLERANCE, found.response).hessian + _prior(mixing).hessian(theta)
     try:
         whole, part = (np.asarray(np.linalg.inv(h)[:n, :n], dtype=float) for h in (hessian, hessian[:n, :n]))
     except np.linalg.LinAlgError as error:

@@ -29,7 +29,7 @@ from naibu.identification.from_fields.forward.sensitivities import Concentrated,
 from naibu.identification.from_fields.inversion.gauss_newton import LONGEST_STEP, Objective
 from naibu.identification.from_fields.inversion.told_combinations import told
 from naibu.identification.from_fields.mesh_error import change_of_fit
-from naibu.identification.from_fields.surface.noise import CorrectedInformation, tangent_columns
+from naibu.identification.from_fields.surface.noise import CorrectedInformation, works_of_moduli
 
 # part of the bias that is reckoned with as a standard deviation after it was taken off: to first order, and from a biased motion
 LEFT = 0.5
@@ -181,6 +181,5 @@ def slope_of_informed(at: Linearised) -> FloatArray:
     out = np.zeros(2 * at.model.zones.count)
     for t, o in enumerate(observed):
         answers[t][o.loaded] = 0.0
-        for k in range(2 * PROBES):
-            out -= tangent_columns(at, t, moved[t][:, k]).T @ answers[t][:, (k + PROBES) % (2 * PROBES)]
+        out -= works_of_moduli(at, t, moved[t], np.roll(answers[t], PROBES, axis=1))
     return out / PROBES

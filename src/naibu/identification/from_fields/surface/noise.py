@@ -21,7 +21,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from naibu.core.arrays import FloatArray
-from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of, modulus_columns
+from naibu.identification.from_fields.forward.load_cases import KNOWN
+from naibu.identification.from_fields.forward.modulus_columns import modulus_columns
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of
 from naibu.identification.from_fields.inversion.told_combinations import told
 
 DRAWS = 16  # of motions
@@ -186,6 +188,16 @@ def tangent_columns(at: Linearised, t: int, direction: FloatArray) -> FloatArray
     ahead, behind = (modulus_columns(model.law, model.zones, lame, shear, state + side * step) for side in (1.0, -1.0))
     scale = float(np.abs(step).max()) / max(float(np.abs(direction).max()), 1e-300)
     return np.asarray((ahead - behind).toarray() / (2.0 * scale))
+
+
+def works_of_moduli(at: Linearised, t: int, along: FloatArray, against: FloatArray) -> FloatArray:
+    """Return the sum (2 count,) of the products of `tangent_columns` of small displacements with others (both n d, r), column by column."""
+    zones = at.model.zones
+    unknown = zones.of_cell != KNOWN
+    lame, shear = moduli_of(zones, at.point.theta)
+    of_lame, of_shear = at.model.law.unit_works(at.point.states[t], along, against)
+    of_cells = (lame * of_lame + shear * of_shear, (lame + 2.0 / 3.0 * shear) * of_lame)
+    return np.concatenate([np.bincount(zones.of_cell[unknown], work[unknown], minlength=zones.count) for work in of_cells])
 
 
 def _changed_derivatives(at: Linearised, moved: Motions) -> Motions:
