@@ -24,7 +24,7 @@ from naibu.mechanics import (
 from naibu.mechanics.contact.penalty_contact import Contact
 from naibu.mechanics.finite_strain.sessions import real_time_session
 from naibu.mechanics.finite_strain.sessions.divided_session import PARTS
-from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession, DynamicState
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
 from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.trial_displacement import Trial
@@ -134,6 +134,28 @@ def test_iterations_whose_error_stays_end_soon_and_begin_nowhere_else(monkeypatc
             ends.append(session.positions())
     assert session.waits <= len(tries) <= 3 * session.waits
     np.testing.assert_allclose(ends[1], ends[0], atol=0.02 * np.abs(ends[0] - made.points).max())
+
+
+def test_iterations_of_a_part_end_where_the_error_stays_though_it_is_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Five of them came to the same."""
+    made, taken = engine(RealTimeEngine, background=False), RealTimeSession._with_contact
+    tries: list[list[DynamicState]] = []
+
+    def unmoved(self: RealTimeSession, *given: Any) -> Generator[None, None, FloatArray | None]:
+        step = yield from taken(self, *given)
+        if not tries or tries[-1][0] is not self.reached:
+            tries.append([])
+        tries[-1].append(self.reached)
+        return None if step is None else 0.0 * step
+
+    without_long_steps(monkeypatch, 0.5 * made.step)
+    monkeypatch.setattr(real_time_session, "ACCEPTED", 1e9)
+    monkeypatch.setattr(real_time_session, "UNLIKELY", 1e9)
+    monkeypatch.setattr(RealTimeSession, "_with_contact", unmoved)
+    with made.session(constrained=held(made.points), indenters=[spherical_indenter((1.0, 2.0, SIZE + 8.05), 8.0)]) as session:
+        session.step(motions=DOWN)
+        assert isinstance(session, RealTimeSession) and session.divided_steps == 1
+    assert max(map(len, tries)) == 2
 
 
 @pytest.mark.parametrize("budget", [np.inf, 0.0])

@@ -266,8 +266,8 @@ class RealTimeSession(DividedSession):
             many = self._condensed is not None and len(self._condensed.nodes) > FEW
             if k >= HOPE and best.error > UNLIKELY:
                 break
-            if unmoved == 2 and best.error > ACCEPTED:
-                self._stays = best.error <= UNLIKELY
+            if unmoved == 2 and (best.error > ACCEPTED or self._duration < self.engine.step):
+                self._stays = ACCEPTED < best.error <= UNLIKELY
                 break
             if k == ITERATIONS and (best.error <= ACCEPTED or best.error > NEARER * begun or many):
                 break
