@@ -23,13 +23,7 @@ from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.morphology import dilated
 from naibu.imaging.preprocessing.object_mask import object_threshold
 from naibu.imaging.volume_correlation.common_content import content_of, require_convergence, require_overlap
-from naibu.imaging.volume_correlation.correlate import (
-    ADAPTATION_SAMPLES,
-    ADAPTATIONS,
-    LEVELS,
-    UNSETTLED,
-    Correlation,
-)
+from naibu.imaging.volume_correlation.correlate import ADAPTATION_SAMPLES, ADAPTATIONS, UNSETTLED, Correlation
 from naibu.imaging.volume_correlation.gauss_newton import (
     COVARIANCE_TOLERANCE,
     REGULAR,
@@ -42,6 +36,7 @@ from naibu.imaging.volume_correlation.image_level import GAIN_RANGE, GainMap, mo
 from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
 from naibu.imaging.volume_correlation.mixed_steps import MixedSteps
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
+from naibu.imaging.volume_correlation.resolution_levels import LEVELS
 from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, blocks_alike, displacement_of_blocks
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.results.hidden_dilatation import loaded_trial_parts
