@@ -121,6 +121,20 @@ def test_a_part_that_matches_for_the_most_part_is_measured_by_itself() -> None:
     assert upper.valid[replaced].mean() < 0.1
 
 
+def test_what_cannot_be_measured_beside_a_part_that_slides_is_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One field of all, which is wrong on both sides of where parts slide, stood there with a small standard deviation."""
+    before, after, _, ball = scans(SLIDE_MM, upper=300.0)
+    lower, upper = intensity_parts(before, ball)
+    one = correlate_volumes(before, after, mask=upper)
+    module = importlib.import_module("naibu.imaging.measure_displacement")
+    monkeypatch.setattr(module, "correlate_volumes", lambda *_, **__: one)
+    monkeypatch.setattr(module, "correlated_parts", lambda *_, **__: ((upper, one),))
+    found = measure_displacement(before, after, mask=ball)
+    assert found.facts["parts"] == 1 and found.displacement.valid[upper].mean() > 0.9
+    assert not found.displacement.valid[lower].any() and np.isnan(found.displacement.vectors[lower]).all()
+    assert any("could not be measured by itself and is not answered" in warning for warning in found.warnings)
+
+
 def test_an_object_that_moves_as_one_is_measured_as_one() -> None:
     before, after, _, ball = scans(0.0, upper=500.0)
     assert "parts" not in measure_displacement(before, after, mask=ball).facts
