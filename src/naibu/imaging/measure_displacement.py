@@ -335,8 +335,8 @@ def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> Meas
     rest = float((inside & ~np.logical_or.reduce([one.mask for one in measured])).sum() / inside.sum())
     if rest > 0.0:
         told.append(
-            f"The rest of the object, {100.0 * rest:.0f} % of its volume, could not be measured by itself and is not answered: one field of "
-            "all is wrong on both sides of where parts slide. A `mask` of a part that moves as one measures it."
+            f"The rest of the object, {100.0 * rest:.0f} % of its volume, could not be measured by itself and is not answered: one field "
+            "of all is wrong on both sides of where parts slide. A `mask` of a part that moves as one measures it."
         )
     return replace(
         first,

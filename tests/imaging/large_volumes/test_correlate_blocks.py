@@ -202,12 +202,14 @@ class Keeping(InProcess):
 
 def test_an_interrupted_run_goes_on_to_the_same_result_where_the_object_shrinks_as_a_whole() -> None:
     """The ratio of volumes at which dilatation is not penalised was forgotten: it is found in the pass that adapts the weights."""
-    grid, grey, rng = Volume.from_array(np.zeros((44,) * 3), spacing_mm=(1.0, 1.0, 1.0)), texture(3, (5.0, 14.0), n=40), np.random.default_rng(5)
+    grid = Volume.from_array(np.zeros((44,) * 3), spacing_mm=(1.0, 1.0, 1.0))
+    grey, rng = texture(3, (5.0, 14.0), n=40), np.random.default_rng(5)
     x, middle = positions(grid), np.full(3, 21.5)
 
     def scan(at: Array, noise: Array) -> ChunkedVolume:
         depth = 17.0 - np.linalg.norm(at - middle, axis=-1)
-        return ChunkedVolume.of(grid.with_values((50.0 + (100.0 + grey(at)) / (1.0 + np.exp(-3.0 * depth)) + 3.0 * noise).astype(np.float32)))
+        values = 50.0 + (100.0 + grey(at)) / (1.0 + np.exp(-3.0 * depth)) + 3.0 * noise
+        return ChunkedVolume.of(grid.with_values(values.astype(np.float32)))
 
     pair = [scan(at, rng.standard_normal(grid.shape)) for at in (x, middle + (x - middle) / 0.9)]
     run = Keeping(*pair)
