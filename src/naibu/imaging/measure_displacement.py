@@ -308,18 +308,16 @@ def _correlated(
     parts = correlated_parts(reference, deformed, inside, found, progress=progress)
     if not parts:
         return measured_by(found, reference, inside, reuse=True)
-    rest = inside & ~np.logical_or.reduce([part for part, _ in parts])
-    each = [*parts, (rest, found)] if rest.any() else parts
-    joined = _joined([measured_by(own, reference, part) for part, own in each], len(parts), inside)
+    joined = _joined([measured_by(own, reference, part) for part, own in parts], inside)
     if joined.displacement.covariance is not None:
-        for one, other in permutations(each, 2):
+        for one, other in permutations(parts, 2):
             at, doubt = doubt_beside(one, other)
             joined.displacement.covariance[at] += doubt
     return joined
 
 
-def _joined(measured: Sequence[MeasuredDisplacement], own: int, inside: BoolArray) -> MeasuredDisplacement:
-    """Return the displacement of parts of an object, the first `own` of which were measured by themselves."""
+def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> MeasuredDisplacement:
+    """Return the displacement of parts of an object that were measured by themselves; the rest of it is not answered."""
     first, *others = measured
     vectors, gradient = first.displacement.vectors.copy(), first.gradient.copy()
     covariance, strain_sd = first.displacement.covariance, first.strain_sd
@@ -333,13 +331,19 @@ def _joined(measured: Sequence[MeasuredDisplacement], own: int, inside: BoolArra
     valid = np.logical_or.reduce([one.displacement.valid for one in measured])
     blocks = [one.blocks for one in measured if one.blocks is not None]
     each = [np.concatenate([getattr(b, name) for b in blocks]) for name in ("points", "vectors", "covariance")]
-    told = f"{own} part(s) of the object, which differ in intensity, have a field of their own: parts slide on each other."
+    told = [f"{len(measured)} part(s) of the object, which differ in intensity, have a field of their own: parts slide on each other."]
+    rest = float((inside & ~np.logical_or.reduce([one.mask for one in measured])).sum() / inside.sum())
+    if rest > 0.0:
+        told.append(
+            f"The rest of the object, {100.0 * rest:.0f} % of its volume, could not be measured by itself and is not answered: one field "
+            "of all is wrong on both sides of where parts slide. A `mask` of a part that moves as one measures it."
+        )
     return replace(
         first,
         displacement=DisplacementField.on_grid(first.displacement.grid, vectors, covariance=covariance, valid=valid),
         mask=inside, gradient=gradient, strain_sd=strain_sd,
         facts=_worst_of([one.facts for one in measured]) | {"parts": len(measured)},
-        warnings=tuple(dict.fromkeys([told, *(doubt for one in measured for doubt in one.warnings)])),
+        warnings=tuple(dict.fromkeys([*told, *(doubt for one in measured for doubt in one.warnings)])),
         blocks=DisplacementField.from_arrays(each[0], each[1], covariance=each[2]),
     )  # fmt: skip
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import deepcopy
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ from naibu.core.chunked_volume import ChunkedVolume
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.imaging.large_volumes import thinning
-from naibu.imaging.large_volumes.correlate_blocks import BlockwiseCorrelation, correlate_blocks
+from naibu.imaging.large_volumes.correlate_blocks import BlockwiseCorrelation, InProcess, correlate_blocks
 from naibu.imaging.large_volumes.field_blocks import VoxelField, boxes_of
 from naibu.imaging.large_volumes.thinning import ThinnedValues, needed_memory_mb, thinned, thinning_factor
 from naibu.imaging.preprocessing.resampling import positions
@@ -182,6 +185,39 @@ def test_a_mask_is_obeyed_and_inclusions_are_not_lost() -> None:
     assert not valid[:, :, SIZE // 2 + 2 :].any()
     assert valid[half].mean() > 0.95
     assert np.linalg.norm((u - scans()[2])[valid], axis=-1).mean() < 0.1
+
+
+class Keeping(InProcess):
+    """Keeps copies of what was computed."""
+
+    def __init__(self, a: ChunkedVolume, b: ChunkedVolume) -> None:
+        super().__init__(a, b)
+        self.there: dict[str, Any] = {}
+
+    def kept(self, name: str, compute: Callable[[], Any]) -> Any:
+        if name not in self.there:
+            self.there[name] = deepcopy(compute())
+        return deepcopy(self.there[name])
+
+
+def test_an_interrupted_run_goes_on_to_the_same_result_where_the_object_shrinks_as_a_whole() -> None:
+    """The ratio of volumes at which dilatation is not penalised was forgotten: it is found in the pass that adapts the weights."""
+    grid = Volume.from_array(np.zeros((44,) * 3), spacing_mm=(1.0, 1.0, 1.0))
+    grey, rng = texture(3, (5.0, 14.0), n=40), np.random.default_rng(5)
+    x, middle = positions(grid), np.full(3, 21.5)
+
+    def scan(at: Array, noise: Array) -> ChunkedVolume:
+        depth = 17.0 - np.linalg.norm(at - middle, axis=-1)
+        values = 50.0 + (100.0 + grey(at)) / (1.0 + np.exp(-3.0 * depth)) + 3.0 * noise
+        return ChunkedVolume.of(grid.with_values(values.astype(np.float32)))
+
+    pair = [scan(at, rng.standard_normal(grid.shape)) for at in (x, middle + (x - middle) / 0.9)]
+    run = Keeping(*pair)
+    straight = correlate_blocks(*pair, settings=SETTINGS, factor=2, edge=44, runner=run).result
+    del run.there["covariance"]  # as of a run that was killed in the last pass
+    resumed = correlate_blocks(*pair, settings=SETTINGS, factor=2, edge=44, runner=run).result
+    np.testing.assert_array_equal(resumed.displacement.vectors, straight.displacement.vectors)
+    np.testing.assert_allclose(resumed.covariance(), straight.covariance(), rtol=1e-5, atol=1e-12)
 
 
 def test_volumes_that_do_not_fit_are_refused() -> None:

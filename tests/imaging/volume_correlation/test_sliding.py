@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -100,6 +101,38 @@ def test_parts_that_differ_in_intensity_are_measured_by_themselves(monkeypatch: 
     off = found.blocks.vectors - truth[at[2], at[1], at[0]]
     held = np.einsum("ni,ni->n", off, np.linalg.solve(found.blocks.covariance, off[..., None])[..., 0]) < CHI_SQUARED_95
     assert held.mean() > 0.85
+
+
+def test_a_part_that_matches_for_the_most_part_is_measured_by_itself() -> None:
+    """Its field was refused, or taken for lost by what is not answered, and that of the whole, which another part drags along, stood."""
+    before, after, truth, ball = scans(SLIDE_MM, upper=300.0)
+    x = positions(before)
+    other = 300.0 + 30.0 * Texture.drawn(2.5, seed=9)(x.reshape(-1, 3)).reshape(SHAPE)
+    replaced = ball & (x[..., 2] > MIDDLE_MM[2] + 1.0) & (x[..., 0] > MIDDLE_MM[0] + 7.0)
+    after = after.with_values(np.where(replaced, other, after.values))
+    left = {"apart_fraction": lambda _: 0.5, "misplaced_fraction": 0.5, "misplacement_at": lambda at: np.full(len(at), 4.0)}
+    whole: Any = SimpleNamespace(volume=before, **left)
+    parts = correlated_parts(before, after, ball, whole)
+    assert len(parts) == 2
+    upper = parts[1][1]
+    kept = ball & (x[..., 2] > MIDDLE_MM[2] + 3.0) & (x[..., 0] < MIDDLE_MM[0] - 5.0)
+    error = np.linalg.norm(upper.displacement.vectors - truth, axis=-1)
+    assert upper.valid[kept].all() and error[kept].mean() < 0.1
+    assert upper.valid[replaced].mean() < 0.1
+
+
+def test_what_cannot_be_measured_beside_a_part_that_slides_is_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One field of all, which is wrong on both sides of where parts slide, stood there with a small standard deviation."""
+    before, after, _, ball = scans(SLIDE_MM, upper=300.0)
+    lower, upper = intensity_parts(before, ball)
+    one = correlate_volumes(before, after, mask=upper)
+    module = importlib.import_module("naibu.imaging.measure_displacement")
+    monkeypatch.setattr(module, "correlate_volumes", lambda *_, **__: one)
+    monkeypatch.setattr(module, "correlated_parts", lambda *_, **__: ((upper, one),))
+    found = measure_displacement(before, after, mask=ball)
+    assert found.facts["parts"] == 1 and found.displacement.valid[upper].mean() > 0.9
+    assert not found.displacement.valid[lower].any() and np.isnan(found.displacement.vectors[lower]).all()
+    assert any("could not be measured by itself and is not answered" in warning for warning in found.warnings)
 
 
 def test_an_object_that_moves_as_one_is_measured_as_one() -> None:

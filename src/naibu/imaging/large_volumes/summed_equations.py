@@ -23,13 +23,7 @@ from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.morphology import dilated
 from naibu.imaging.preprocessing.object_mask import object_threshold
 from naibu.imaging.volume_correlation.common_content import content_of, require_convergence, require_overlap
-from naibu.imaging.volume_correlation.correlate import (
-    ADAPTATION_SAMPLES,
-    ADAPTATIONS,
-    LEVELS,
-    UNSETTLED,
-    Correlation,
-)
+from naibu.imaging.volume_correlation.correlate import ADAPTATION_SAMPLES, ADAPTATIONS, UNSETTLED, Correlation
 from naibu.imaging.volume_correlation.gauss_newton import (
     COVARIANCE_TOLERANCE,
     REGULAR,
@@ -42,6 +36,7 @@ from naibu.imaging.volume_correlation.image_level import GAIN_RANGE, GainMap, mo
 from naibu.imaging.volume_correlation.intensity_comparison import MAD, ROUNDING
 from naibu.imaging.volume_correlation.mixed_steps import MixedSteps
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
+from naibu.imaging.volume_correlation.resolution_levels import LEVELS
 from naibu.imaging.volume_correlation.results.block_displacements import BlockSums, block_edge, blocks_alike, displacement_of_blocks
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
 from naibu.imaging.volume_correlation.results.hidden_dilatation import loaded_trial_parts
@@ -69,6 +64,8 @@ class Model:
         Whether the last step was short.
     steps : MixedSteps
         Those before, at these voxels and weights.
+    ratio : float
+        See `SplineSystem`.
     """
 
     coefficients: FloatArray
@@ -83,6 +80,7 @@ class Model:
     passes: int = 0
     settled: bool = False
     steps: MixedSteps = field(default_factory=MixedSteps)
+    ratio: float = 1.0
 
 
 class SummedEquations:
@@ -112,7 +110,7 @@ class SummedEquations:
         reliability = fit.reliability_of(fit.cell_agreement())
         self.model = Model(
             coarse.c, coarse.bending, coarse.dilatation, self._gain(matrix, load, fit.residual_sd, everywhere), fit.residual_sd,
-            coarse.settings.jitter_sd_voxels, reliability,
+            coarse.settings.jitter_sd_voxels, reliability, ratio=self.system.ratio,
         )  # fmt: skip
 
     def _frame(self, factor: int) -> BlockFrame:
@@ -181,6 +179,7 @@ class SummedEquations:
         sums, coarse = self._added(blocks), self.coarse
         before, passes, plan = self.model.coefficients, self.model.passes + 1, self.schedule
         coarse.c, coarse.bending, coarse.dilatation = before.copy(), self.model.bending, self.model.dilatation
+        self.system.ratio = self.model.ratio  # of an interrupted run, too
         self._settle(sums, before)
         if self.adapting and passes == plan.adapted:
             self._adapt(sums, before)
@@ -194,7 +193,7 @@ class SummedEquations:
             jitter = self.fit.bounded_jitter(float(np.sqrt(sums.jitter / sums.seen)))
         return replace(
             found, jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending,
-            dilatation=coarse.dilatation, passes=passes, steps=steps,
+            dilatation=coarse.dilatation, passes=passes, steps=steps, ratio=self.system.ratio,
             settled=passes >= plan.least and self.fit.moving_fraction <= UNSETTLED, products=sums.products, pairs=sums.pairs,
         )  # fmt: skip
 
@@ -209,6 +208,7 @@ class SummedEquations:
         sums, coarse, fit = self._added(blocks), self.coarse, self.fit
         before = self.model.coefficients
         coarse.c, coarse.bending, coarse.dilatation = before.copy(), self.model.bending, self.model.dilatation
+        self.system.ratio = self.model.ratio  # of an interrupted run, too
         require_overlap(sums.seen / max(sums.voxels, 1))
         content = content_of(fit, sums.content)
         content.refuse_chance(self.system.inner)

@@ -69,8 +69,8 @@ class CommonContent:
         """Cells (m,) with a texture that both volumes share; the displacement of others would be an extrapolation."""
         return np.asarray(self.agreement > np.where(self.structure > MUCH_STRUCTURE, MATCHED_IF_STRUCTURED, MATCHED))
 
-    def refuse_chance(self, inner: BoolArray) -> None:
-        """Refuse volumes that agree in a part of the given cells (m,) only, and differ elsewhere by more than noise.
+    def refuse_chance(self, inner: BoolArray, least: float = LEAST_MATCHED) -> None:
+        """Refuse volumes that agree in less than a share `least` of the given cells (m,), and differ elsewhere by more than noise.
 
         Raises
         ------
@@ -78,7 +78,7 @@ class CommonContent:
             Such volumes.
         """
         share, other = float(self.matched[inner].mean()), inner & ~self.matched
-        if share < LEAST_MATCHED and float(np.median(self.structure[other])) > STRUCTURED:
+        if share < least and float(np.median(self.structure[other])) > STRUCTURED:
             raise InputError(
                 f"the volumes match in {100.0 * share:.0f} % of the object only, and what is left elsewhere after registration has the "
                 "structure of "

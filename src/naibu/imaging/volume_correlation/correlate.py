@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -32,7 +32,13 @@ from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
 from naibu.imaging.preprocessing.intensity_parts import intensity_parts
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.resampling import require_mask
-from naibu.imaging.volume_correlation.common_content import common_content, refuse_unrelated, require_convergence, require_overlap
+from naibu.imaging.volume_correlation.common_content import (
+    LEAST_MATCHED,
+    common_content,
+    refuse_unrelated,
+    require_convergence,
+    require_overlap,
+)
 from naibu.imaging.volume_correlation.gauss_newton import (
     INSIDE_INCLUSION,
     SAMPLE_TOLERANCE,
@@ -44,6 +50,7 @@ from naibu.imaging.volume_correlation.gauss_newton import (
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise, lost_to_robustness
+from naibu.imaging.volume_correlation.resolution_levels import HALVINGS, LEVELS, voxel_stride, voxel_strides
 from naibu.imaging.volume_correlation.results.block_displacements import block_displacements
 from naibu.imaging.volume_correlation.results.cell_errors import misplacement_variance
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult, collected
@@ -87,34 +94,6 @@ LEAST_WEIGHT = 1e-3  # of the dilatation weight of the round before
 DEFAULT = CorrelationSettings()
 
 
-@dataclass(frozen=True, slots=True)
-class _Level:
-    """Resolution level: how far voxels are thinned out, and how its fit differs from that of the finest level.
-
-    Attributes
-    ----------
-    voxels_per_cell : int
-        Voxels along a cell that are taken, at least one of every cell.
-    robust, bending : float
-        Factors on the settings `robust` and `bending_weight`: far from registered residuals are large, and a stiff field takes out most.
-    steps : int
-        Gauss-Newton steps.
-    anchoring : float
-        See `Iterations.anchoring`.
-    """
-
-    voxels_per_cell: int
-    robust: float
-    bending: float
-    steps: int
-    anchoring: float = 0.0
-
-
-# the cells are halved between the first and the second level, and between the second and the third; the last level has all voxels
-LEVELS = (_Level(2, 3.0, 20.0, 8, 0.05), _Level(2, 2.0, 1.0, 8, 0.01), _Level(4, 1.0, 1.0, 3), _Level(0, 1.0, 1.0, 4))
-HALVINGS = 2
-
-
 def correlate_volumes(
     reference: Volume,
     deformed: Volume,
@@ -123,6 +102,7 @@ def correlate_volumes(
     deformed_mask: ArrayLike | None = None,
     rigid_mask: ArrayLike | None = None,
     settings: CorrelationSettings = DEFAULT,
+    least_matched: float = LEAST_MATCHED,
     progress: Progress | None = None,
 ) -> CorrelationResult:
     """Measure the displacement field of an object by global digital volume correlation (DVC), with covariance and gradient.
@@ -139,6 +119,8 @@ def correlate_volumes(
         Rigid inclusions: labels from 1, or true in each connected inclusion; by default they are found.
     settings : CorrelationSettings
         Grid, penalties, robustness, covariance.
+    least_matched : float
+        Share of the object that has to match, unless noise explains the rest; lower it where it is known that both show the same object.
     progress : Progress, optional
         Called for every resolution level, inclusion and adaptation of the weights.
 
@@ -167,7 +149,7 @@ def correlate_volumes(
         correlation.refine()
         correlation.find_inclusions(rigid_mask)
         correlation.adapt()
-        return correlation.result()
+        return correlation.result(least_matched)
 
 
 class Correlation:
@@ -203,7 +185,7 @@ class Correlation:
         self.step = settings.cell_size_mm(float(self.mask.sum()), self.spacing)
         margin = 1.5 * self.spacing
         self.grid = SplineGrid.around(low * self.spacing - margin, high * self.spacing + margin, self.step, halvings=HALVINGS)
-        self.strides = _strides(self.step, self.spacing)
+        self.strides = voxel_strides(self.step, self.spacing)
         self.inclusions: list[RigidInclusion] = []
         self.ratio, self.dilatation_factor = 1.0, 1.0
         self.c = np.zeros_like(self.grid.nodes_mm)
@@ -244,7 +226,7 @@ class Correlation:
     def initialize(self) -> None:
         """Find the rigid motion, and put it on the coarsest grid."""
         report_progress(self.progress, "rigid initialization")
-        stride = _stride(self.step, self.spacing, 1)
+        stride = voxel_stride(self.step, self.spacing, 1)
         level = self.level(stride, self.settings.smoothing_voxels)
         thin = tuple(slice(None, None, s) for s in stride[::-1])
         # only what both scans can show is compared: else the part that one of them lacks would shift the object and stretch its outline
@@ -409,8 +391,8 @@ class Correlation:
         penalties = self.bending, self.dilatation * fit.system.gauss_volume
         return weight_contrasts(fit, self.c, penalties, parts, noise, self.settings.seed + 3, drawn, bias)
 
-    def result(self) -> CorrelationResult:
-        """Draw the covariance, and return the result."""
+    def result(self, least_matched: float) -> CorrelationResult:
+        """Draw the covariance, and return the result, unless less than a share of the object matches."""
         report_progress(self.progress, "covariance")
         fit, system = self.fit, self.fit.system
         fit.reliability = None
@@ -422,7 +404,7 @@ class Correlation:
         refuse_unrelated(fit)
         return_freed_memory()  # of the steps
         content = common_content(fit, fit.level.depth_mm(self.mask))
-        content.refuse_chance(system.inner)
+        content.refuse_chance(system.inner, least_matched)
         require_convergence(fit.moving_fraction)
         for inclusion in self.inclusions:
             inclusion.draws.clear()
@@ -437,14 +419,3 @@ class Correlation:
         contrasts = partial(self.contrasts, noise, drawn)
         found = collected(self.volume, fit, self.c, samples, self.bending, self.dilatation, content, misfit, hidden, contrasts)
         return replace(found, blocks=blocks)
-
-
-def _stride(step: FloatArray, spacing: FloatArray, part: int) -> tuple[int, ...]:
-    """Return the stride of voxels along x, y, z with which `part` of them lie along a cell."""
-    return tuple(int(n) for n in np.maximum(np.round(step / part / spacing), 1))
-
-
-def _strides(step: FloatArray, spacing: FloatArray) -> list[tuple[int, ...]]:
-    """Return the strides of all levels, the last of which takes every voxel."""
-    fine = [_stride(step, spacing, level.voxels_per_cell) for level in LEVELS[:-1]]
-    return fine if max(fine[-1]) == 1 else [*fine, (1, 1, 1)]

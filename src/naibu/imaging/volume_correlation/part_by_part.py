@@ -37,6 +37,8 @@ OF_THE_OTHER = 0.25
 # of what one field leaves apart in a part. Where the own field of a part leaves less than that, parts slide on each other, and one field is
 # wrong on both sides of where they do: every part then has its own, unless that leaves so much more that it has lost its way
 LESS, LOST = 0.8, 2.0
+# share of a part that has to match: both scans are known to show it. What does not match is not answered, as what slides within it
+LEAST_MATCHED = 0.5
 SAMPLED = 7  # every so many voxels of a part are looked at
 
 
@@ -71,11 +73,12 @@ def correlated_parts(
     found, left = [], []
     for part, there in zip(parts, shown or (None,) * len(parts), strict=True):
         try:
-            own = correlate_volumes(reference, deformed, mask=part, deformed_mask=there, progress=progress)
+            own = correlate_volumes(reference, deformed, mask=part, deformed_mask=there, least_matched=LEAST_MATCHED, progress=progress)
         except InputError:
             continue  # too small, or without content in common: the field of the whole object stands, and tells that it is uncertain
         found.append((part, own))
-        left.append((_left_apart(own, part), _left_apart(whole, part)))
+        answered = part & own.valid
+        left.append((_left_apart(own, answered), _left_apart(whole, answered)))
     jumping = len(found) == len(parts) and jump_fraction(*found) > JUMPING
     if not jumping and whole.misplaced_fraction < APART:
         return ()
@@ -130,6 +133,8 @@ def _answered(found: CorrelationResult, at: IntArray) -> tuple[FloatArray, Float
 
 
 def _left_apart(found: CorrelationResult, part: BoolArray) -> float:
-    """Return the mean distance, mm, that a field leaves between structures of a part."""
+    """Return the mean distance, mm, that a field leaves between structures of a part; NaN if that has no voxels."""
     at = np.argwhere(part)[::SAMPLED, ::-1]
+    if not len(at):
+        return float("nan")
     return float(np.nanmean(np.sqrt(found.misplacement_at(found.volume.to_physical(at)))))
