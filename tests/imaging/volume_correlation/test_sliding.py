@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +18,7 @@ from naibu.imaging.preprocessing.intensity_parts import intensity_parts
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.part_by_part import correlated_parts, doubt_beside, jump_fraction, with_own_field
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 from naibu.validation.scanners.textures import Texture
 
 SHAPE, SPACING_MM, SLIDE_MM = (44, 52, 60), (1.0, 1.0, 1.0), 6.0
@@ -42,6 +44,13 @@ def scans(slide_mm: float, upper: float = 150.0) -> tuple[Volume, Volume, FloatA
 
     ball = (((x - MIDDLE_MM) / HALF_AXES_MM) ** 2).sum(axis=-1) < 1.0
     return frame.with_values(seen(x)), frame.with_values(seen(x - halves(x, slide_mm))), halves(x, slide_mm), ball
+
+
+@cache
+def own_fields(slide_mm: float) -> list[tuple[BoolArray, CorrelationResult]]:
+    """Return the parts of a ball whose upper half is brighter, and the field of each."""
+    before, after, _, ball = scans(slide_mm, upper=300.0)
+    return [(part, correlate_volumes(before, after, mask=part)) for part in intensity_parts(before, ball)]
 
 
 def covered(slide_mm: float) -> tuple[float, float, float]:
@@ -124,8 +133,7 @@ def test_a_part_that_matches_for_the_most_part_is_measured_by_itself() -> None:
 def test_what_cannot_be_measured_beside_a_part_that_slides_is_not_answered(monkeypatch: pytest.MonkeyPatch) -> None:
     """One field of all, which is wrong on both sides of where parts slide, stood there with a small standard deviation."""
     before, after, _, ball = scans(SLIDE_MM, upper=300.0)
-    lower, upper = intensity_parts(before, ball)
-    one = correlate_volumes(before, after, mask=upper)
+    (lower, _), (upper, one) = own_fields(SLIDE_MM)
     module = importlib.import_module("naibu.imaging.measure_displacement")
     monkeypatch.setattr(module, "correlate_volumes", lambda *_, **__: one)
     monkeypatch.setattr(module, "correlated_parts", lambda *_, **__: ((upper, one),))
@@ -153,11 +161,7 @@ def test_a_small_slide_is_seen_where_the_fields_of_parts_differ() -> None:
 
 
 def test_parts_that_move_as_one_do_not_jump_and_what_jumps_is_in_doubt_beside_it() -> None:
-    fields = {}
-    for slide_mm in (0.0, SLIDE_MM):
-        before, after, _, ball = scans(slide_mm, upper=300.0)
-        parts = intensity_parts(before, ball)
-        fields[slide_mm] = [(part, correlate_volumes(before, after, mask=part)) for part in parts]
+    fields = {slide_mm: own_fields(slide_mm) for slide_mm in (0.0, SLIDE_MM)}
     assert jump_fraction(*fields[0.0]) < 0.02
     assert jump_fraction(*fields[SLIDE_MM]) > 0.5
     (part, _), (other, _) = fields[SLIDE_MM]
