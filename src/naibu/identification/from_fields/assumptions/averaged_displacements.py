@@ -22,7 +22,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.assumptions.assumed_law import told_changes
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
-from naibu.identification.from_fields.forward.forward_model import Observed, whitening
+from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Linearised, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, fitted_near
@@ -95,7 +95,9 @@ def averaging(test: ScoreTest, residuals: Sequence[FloatArray], stretch: FloatAr
     square = max(one.points * float((r**2).mean()) for one, r in zip(kernels, residuals, strict=True))
     if asked.part + ALLOWED * float(np.sqrt(square / asked.size)) < LEAST:
         return None
-    times, theta = _fitted(at, [one.length_mm for one in kernels], bounds)
+    left = np.concatenate(residuals)
+    as_noise = float(np.sqrt((left**2).mean())) <= WITHIN_NOISE  # averages leave less than the noise; what leaves more is not only they
+    times, theta = _fitted(at, [one.length_mm for one in kernels], bounds) if as_noise else (1.0, None)
     return Averaging(times * max(one.length_mm for one in kernels), stretch * (asked.theta if theta is None else theta))
 
 
@@ -137,12 +139,12 @@ def _fitted(at: Linearised, lengths: Sequence[float], bounds: Bounds) -> tuple[f
 
     Lengths are standard deviations for every load case, mm, 0 for none.
     """
-    model, least = at.model, np.inf
+    model, least, solvers = at.model, np.inf, Solvers(at.model.law, at.model.points)  # those of the best fit hold its factors
     best: tuple[float, FloatArray | None] = (1.0, None)
     for times in LONGER ** np.arange(TRIED):
         averaged = copy(model)
         averaged.observed = tuple(_averaged(model.computed, o, times * s) for o, s in zip(model.observed, lengths, strict=True))
-        averaged.boundary = model.boundary.copied()
+        averaged.boundary, averaged.solvers = model.boundary.copied(), solvers
         found = fitted_near(averaged, at.point.theta, at.point.states, bounds)
         if found is not None and found.misfit < least:
             best, least = (float(times), found.theta - at.point.theta), found.misfit
