@@ -265,6 +265,8 @@ def _nearer(
     if kept is None:
         return guess
     u, (residual, norm) = guess, _unbalanced(load_case, law.forces(lame, shear, guess))
+    if norm <= NEWTON_TOLERANCE:
+        return guess
     while np.isfinite(norm) and norm > KEPT_TOLERANCE:
         step = np.where(load_case.loaded, 0.0, kept.solve(residual.ravel()).reshape(u.shape))
         residual, new = _unbalanced(load_case, law.forces(lame, shear, u - step))
