@@ -11,9 +11,10 @@ import pytest
 
 from naibu.core.arrays import FloatArray
 from naibu.mechanics import Assembler, IndenterVelocity, RealTimeEngine, body_force, elements, material, spherical_indenter
-from naibu.mechanics.finite_strain.sessions import condensed_contact, real_time_session, tangent_session
+from naibu.mechanics.finite_strain.sessions import real_time_session, tangent_session
 from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicState
 from naibu.mechanics.finite_strain.sessions.real_time_session import RealTimeSession
+from naibu.mechanics.finite_strain.sessions.tangents import condensed_contact
 from naibu.mechanics.finite_strain.sessions.tangents.condensed_contact import CondensedContact
 from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
 from naibu.mechanics.finite_strain.sessions.trial_displacement import Trial

@@ -241,6 +241,6 @@ def test_parts_that_hinge_on_an_edge_and_thin_plates_get_factors_too():
 
 def test_without_the_fast_solver_the_factors_are_the_same(monkeypatch):
     known = cubes(8, 1)[1].scale
-    for module in ("lattices.model.octree_compliance_correction", "linear_algebra.direct", "linear_algebra.solver_selection"):
+    for module in ("lattices.model.octrees.compliance_correction", "linear_algebra.direct", "linear_algebra.solver_selection"):
         monkeypatch.setattr(f"naibu.mechanics.{module}.pardiso_library", lambda: None)
     np.testing.assert_allclose(octree_lattice(box_mask((8, 8, 8)), 1.0, 1, density=1e-6).scale, known, rtol=1e-4)

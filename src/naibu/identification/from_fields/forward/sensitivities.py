@@ -406,10 +406,10 @@ class Linearised:
 
     def _with_equilibrium(self, basis: FloatArray, tolerance: float) -> Concentrated | None:
         """Return what `concentrated` does, by the systems of this point; None where there are none, or they are not exact."""
-        made = [self.boundary(t) for t in range(len(self.columns))]
-        own = [one.factor for t, one in enumerate(made) if one is self._own.get(t) and isinstance(one.factor, WithEquilibrium)]
-        found = [f.followed(o, c @ basis) for f, o, c in zip(own, self.model.observed, self.columns, strict=len(own) == len(made))]
-        parts = [part for part in found if part is not None]
+        made = [(t, self.boundary(t)) for t in range(len(self.columns))]
+        own = [one.factor for t, one in made if one is self._own.get(t) and isinstance(one.factor, WithEquilibrium)]
+        of_cases = zip(own, self.model.observed, self.columns, strict=True) if len(own) == len(made) else ()
+        parts = [part for f, o, c in of_cases if (part := f.followed(o, c @ basis)) is not None]
         if len(parts) < len(made):
             return None
         theta, loaded = self.gradient()
