@@ -70,6 +70,8 @@ def asked_ratios(test: ScoreTest, variance: float, stretch: FloatArray) -> tuple
     at, model, out = test.at, test.at.model, []
     most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
     for number, region in enumerate(model.zones.known):
+        if region.is_rigid:
+            continue
         lame, shear = moduli_of(model.zones, at.point.theta)
         cells, near = model.zones.region_of_cell == number, other_poisson_ratio(region.poisson_ratio)
         lame[cells], shear[cells] = lame_parameters(region.young_modulus, near)
