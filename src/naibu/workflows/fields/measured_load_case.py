@@ -180,11 +180,7 @@ def doubts_of_field(name: str, field: DisplacementField) -> tuple[str, ...]:
 
 def beyond_object(name: str, field: DisplacementField, inside: Volume) -> tuple[str, ...]:
     """Say which part of a field lies outside of the object, the voxels of `inside` that are not zero, where that is more than its rim."""
-    at = field.at_points()
-    index = np.round(inside.to_index(at.points[at.valid])).astype(int)[:, ::-1]
-    within = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
-    within[within] = inside.values[tuple(index[within].T)] != 0
-    if (share := 1.0 - float(within.mean())) <= MOST_BEYOND:
+    if (share := _share_beyond(field, inside)) <= MOST_BEYOND:
         return ()
     return (
         f"{name}: {100 * share:.0f} % of its points lie outside of the object that the mask or the zones show, and are not used. "
@@ -198,14 +194,9 @@ def beyond_rim(name: str, field: DisplacementField, inside: Volume) -> tuple[str
     Where surfaces are free, the model has them where the mask ends. As many points of equal density as lie outside take up a rim of the
     volume of the mask times their number over that of the others, over its surface.
     """
-    at, voxels = field.at_points(), np.pad(np.asarray(inside.values != 0), 1)
-    index = np.round(inside.to_index(at.points[at.valid])).astype(int)[:, ::-1] + 1
-    near = np.asarray(((index >= 0) & (index < voxels.shape)).all(axis=1))
-    within = np.zeros(len(index), dtype=bool)
-    within[near] = voxels[tuple(index[near].T)]
-    share = 1.0 - float(within.mean())
-    if not 0.0 < share <= MOST_BEYOND:
+    if not 0.0 < (share := _share_beyond(field, inside)) <= MOST_BEYOND:
         return ()
+    voxels = np.pad(np.asarray(inside.values != 0), 1)
     size = np.asarray(inside.spacing_mm)[::-1]  # along the axes of the array
     faces = np.array([np.count_nonzero(np.diff(voxels, axis=a)) for a in range(3)])
     volume = float(np.prod(size)) * np.count_nonzero(voxels)
@@ -217,6 +208,15 @@ def beyond_rim(name: str, field: DisplacementField, inside: Volume) -> tuple[str
         f"{thick:.2g} mm. If the object reaches so far, its free surfaces are not where the model has them, and moduli, the law or the "
         "readings of its vectors are blamed for that: make the mask larger.",
     )
+
+
+def _share_beyond(field: DisplacementField, inside: Volume) -> float:
+    """Return which part of the points of a field lies where no voxel differs from zero."""
+    at = field.at_points()
+    index = np.round(inside.to_index(at.points[at.valid])).astype(int)[:, ::-1]
+    within = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
+    within[within] = inside.values[tuple(index[within].T)] != 0
+    return 1.0 - float(within.mean())
 
 
 def _require_deformation(name: str, field: DisplacementField) -> None:

@@ -24,6 +24,7 @@ from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATI
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, moduli_of, young_and_poisson
+from naibu.identification.from_fields.inversion.regularization import cell_volumes
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.point_location import locate, operator_of
 from naibu.meshing.surface import face_normals, faces_of_cells, node_areas
@@ -93,7 +94,7 @@ def asked_sliding(test: ScoreTest, variance: float, stretch: FloatArray) -> Slid
     borders = _borders(model, test.at.point.theta) if model.mesh.dimension == 3 and test.errors.any() else []
     if not 0 < len(borders) <= MOST_BORDERS:
         return None
-    edge = float((_volume(model.mesh) / model.mesh.n_cells) ** (1.0 / 3.0))
+    edge = float(cell_volumes(model.mesh).mean() ** (1.0 / 3.0))
     residuals = [np.ones(len(o.data), dtype=bool) for o in model.observed]
     most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
     best, largest = None, 0.0
@@ -128,12 +129,6 @@ def judged_sliding(judged: Verdict, found: Sliding | None, zones: Zones, theta: 
     )
     reasons = tuple(reason for reason in judged.reasons if not (first and reason.startswith(DOES_NOT_FIT)))
     return replace(judged, reasons=reasons).in_part(why, first=first)
-
-
-def _volume(mesh: Mesh) -> float:
-    """Return the volume, mm^3, by the divergence theorem."""
-    faces = faces_of_cells(mesh.cells, mesh.cell_type).faces
-    return float((face_normals(mesh.points, faces) * mesh.points[faces].mean(axis=1)).sum() / 3.0)
 
 
 def _borders(model: FieldModel, theta: FloatArray) -> list[Border]:
