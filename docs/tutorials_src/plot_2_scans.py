@@ -64,6 +64,6 @@ print(f"against the truth: median {np.median(error):.3f} mm, 95th percentile {np
 # Moduli
 # ------
 # ``moved/field.h5`` is what the identification takes, with a volume of labels for the parts and the modulus of one of them. How it is
-# done, and how far it can be trusted, is told in :doc:`/fields`; :doc:`/gallery/plot_stiffness_of_zones` runs it on a body whose moduli
-# are known.
+# done is told in :doc:`/fields`, how far it can be trusted in :doc:`/field_checks`; :doc:`/gallery/plot_stiffness_of_zones` runs it on a
+# body whose moduli are known.
 print("files:", ", ".join(sorted(file.name for file in (place / "moved").iterdir())))
