@@ -77,7 +77,9 @@ def told_by_markers(model: CalibratedModel) -> NormalEstimate:
 
 
 def _moduli(model: CalibratedModel) -> list[Parameter]:
-    return [p for p in model.parameters.free if p.name.endswith((young_modulus(""), poisson_ratio("")))]
+    """Moduli that another kind of data may tell as well: none that follows from the weight, which is in kPa where others are ratios."""
+    kinds = (poisson_ratio(""),) if model.is_weighed else (young_modulus(""), poisson_ratio(""))
+    return [p for p in model.parameters.free if p.name.endswith(kinds)]
 
 
 def _logarithm(model: CalibratedModel, p: Parameter) -> float:

@@ -10,7 +10,7 @@ import pytest
 
 from naibu import datasets
 from naibu.core.experiment import Experiment, Loading
-from naibu.identification.from_markers.calibration import initial_parameters
+from naibu.identification.from_markers.calibration import calibrate, initial_parameters
 from naibu.identification.from_markers.consider_parameters import with_considered
 from naibu.identification.from_markers.gauss_newton import Matcher
 from naibu.identification.from_markers.known_materials import KnownMaterials
@@ -24,18 +24,22 @@ from naibu.identification.from_markers.specimen.parameter_names import (
 )
 from naibu.identification.from_markers.specimen.resting_state import resting_state
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings, specimen
+from naibu.identification.prediction.calibrated_model import CalibratedModel
 from naibu.mechanics.finite_strain.statics import solve
 from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, virtual_specimen
+from naibu.viewer.result_page.estimates import parameter_cards
+from naibu.workflows.results.report_content import parameter_rows
 
 SIZE, YOUNG = (40.0, 60.0, 30.0), 8.0
 TRUTH = {young_modulus("gel"): YOUNG, poisson_ratio("gel"): 0.48, friction("gel", "table"): 0.2, friction("gel", "acrylic"): 0.2}
 EXACT = Scanner(placing_mm=0.05, xy_step_mm=0.0, z_step_mm=0.0)
 
 
-def squeezed(width_mm: float) -> Experiment:
-    """A very soft block between side plates, computed whole on elements of its own."""
+def squeezed(width_mm: float, *, heavier: float = 1.0) -> Experiment:
+    """A very soft block between side plates, computed whole on elements of its own; something holds it down as if it were `heavier`."""
     template = box_experiment("soft", SIZE, [("gel", SIZE[2])], Loading("side_plates"), {"pressed": width_mm}, margin_mm=5.0)
-    return virtual_specimen(template, TRUTH, settings=ModelSettings(element_size_mm=7.0)).scanned(seed=2, scanner=EXACT).experiment
+    settings = ModelSettings(element_size_mm=7.0, density=1e-6 * heavier)
+    return virtual_specimen(template, TRUTH, settings=settings).scanned(seed=2, scanner=EXACT).experiment
 
 
 def test_a_block_settles_under_its_weight_as_a_column_does() -> None:
@@ -101,3 +105,20 @@ def test_a_stated_height_that_a_modulus_follows_from_is_uncertain_in_predictions
     parameters = with_considered(body, initial_parameters([body], {measured.name: ["width_100"]}, KnownMaterials()))
     (base,) = (p for p in parameters.free if p.name == straight_base(measured))
     assert base.value == 20.0 and base.prior_sd == 1.0
+
+
+def test_a_modulus_that_follows_from_the_weight_is_a_lower_bound_unless_nothing_else_is_said_to_hold_the_object() -> None:
+    """Half of what holds this block down is not its weight, so that it looks half as stiff as it is."""
+    experiment, name = squeezed(50.0, heavier=2.0), young_modulus("gel")
+    settings = ModelSettings(element_size_mm=9.0)
+    found = CalibratedModel.of(calibrate([experiment], settings=settings, with_mesh_error=False))
+    low, high = found.interval(name)
+    assert found.is_lower_bound(name) and low < YOUNG < high == np.inf
+    assert found.interval_of_model(name)[1] < YOUNG  # what the model alone would have said
+    assert np.isfinite(found.interval(poisson_ratio("gel"))).all()
+    stated = replace(found, settings=replace(settings, modulus="weighed"))
+    assert stated.interval(name) == found.interval_of_model(name)
+    (row,) = (r for r in parameter_rows(found, [name]) if r.name == name)
+    assert (row.lower, row.upper) == (low, np.inf) and "if nothing but its weight holds the object down" in row.remarks
+    (card,) = parameter_cards([row])
+    assert card.value == f"at least {low:.3g} kPa"

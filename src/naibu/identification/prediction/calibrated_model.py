@@ -85,6 +85,20 @@ class CalibratedModel:
         named = [(m, e) for m, e in self.known_materials.young_moduli.items() if relative and young_modulus(m) in fixed]
         return named[0] if named else None
 
+    @property
+    def is_weighed(self) -> bool:
+        """Whether moduli are in kPa because they were sought from the weight of the object."""
+        stated = self.known_materials.young_moduli and self.known_materials.scale_is_absolute
+        return not stated and self.reference is None
+
+    def is_lower_bound(self, name: str) -> bool:
+        """Whether a parameter is a modulus that only bounds the true one from below, as it follows from the weight of the object.
+
+        Whatever else holds the object on its table, such as a base that sticks, looks like a smaller modulus. With
+        ``ModelSettings(modulus="weighed")`` it is stated that nothing does.
+        """
+        return self.is_weighed and self.settings.modulus == "automatic" and name.endswith(young_modulus(""))
+
     def shown(self, p: Parameter) -> tuple[float, str]:
         """Return the factor from a parameter to the number told of it, and its unit: multiples where no modulus is known."""
         if self.reference is None or not p.unit.startswith("kPa"):
@@ -126,8 +140,14 @@ class CalibratedModel:
 
         They hold whichever law the material obeys; with `law_exact` those that hold if it obeys the law that was assumed.
 
-        They respect physics: a Poisson's ratio is at least -1, and a positive parameter known to no power of `UNBOUNDED` has no bounds.
+        They respect physics: a Poisson's ratio is at least -1, and a positive parameter known to no power of `UNBOUNDED` has no bounds. A
+        modulus that is a lower bound (`is_lower_bound`) has no upper one.
         """
+        low, high = self.interval_of_model(name, width, law_exact=law_exact)
+        return low, np.inf if self.is_lower_bound(name) else high
+
+    def interval_of_model(self, name: str, width: float = 1.959964, *, law_exact: bool = False) -> tuple[float, float]:
+        """Return the bounds of a parameter if only what the model holds acts on the object: of a modulus that is a lower bound both."""
         parameter = next(p for p in self.parameters if p.name == name)
         centre, half = parameter.inner(parameter.value), min(width * self.standard_deviation(name, law_exact=law_exact), LARGEST_EXPONENT)
         if parameter.scale == "log" and half > np.log(UNBOUNDED):

@@ -69,10 +69,10 @@ def _card(row: ParameterRow) -> Card:
     low, high = (math.isfinite(v) for v in (row.lower, row.upper))
     if row.note or not (low or high):
         return Card(row.label, value, row.note or "not bounded by the data")
-    if low and high:
-        interval = f"{_plain(row.lower, width)} to {_plain(row.upper, width)}"
-    else:
-        interval = f"above {_plain(row.lower, width)}" if low else f"below {_plain(row.upper, width)}"
+    if not (low and high):  # the estimate is no more likely than what lies on the open side
+        bound = f"at least {row.lower:.3g}" if low else f"at most {row.upper:.3g}"
+        return Card(row.label, f"{bound} {row.unit}".rstrip(), "; ".join(filter(None, ("95 %", row.beside))))
+    interval = f"{_plain(row.lower, width)} to {_plain(row.upper, width)}"
     return Card(row.label, value, f"95 %: {interval}{f'; {row.beside}' * bool(row.beside)}")
 
 

@@ -245,6 +245,8 @@ def _identified(model: CalibratedModel, source: Source | None) -> TouchableModel
     if model.reference is not None:
         material_of_scale, modulus = model.reference
         said += (f"No modulus is known: that of {material_of_scale} is taken as {modulus:g} kPa, and forces are in proportion to it.",)
+    if model.is_weighed:
+        said += ("Moduli follow from the weight of the object, and may be larger where something else held it down; so may forces.",)
     return _doubted(TouchableModel(f"{experiment.name}, touched", said, touched, "equivalent strain, %", nodes, weights), model)
 
 

@@ -205,10 +205,10 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
     for p in model.parameters:
         if p.name in names or (p.fixed and p.name.endswith("young_modulus")):
             low, high = model.interval(p.name)
-            low = -np.inf if np.isinf(high) else low
+            low = -np.inf if np.isinf(high) and not model.is_lower_bound(p.name) else low
             note = "" if not p.fixed else ("given" if model.reference is None else "sets the scale: moduli are ratios to it")
             factor, unit = model.shown(p)
-            beside = _by_law(p, model)
+            beside = _if_only_weight(p, model) or _by_law(p, model)
             rows.append(ParameterRow(p.name, parameter_label(p.name), factor * p.value, factor * low, factor * high, unit, note, beside))
     return tuple(rows)
 
@@ -216,10 +216,11 @@ def parameter_rows(model: CalibratedModel, names: Sequence[str]) -> tuple[Parame
 def undetermined(model: CalibratedModel, names: Sequence[str], priors: ParameterSet | None = None) -> tuple[str, ...]:
     """Return, in words, what the data do not determine about the parameters `names`; `priors` tells what was assumed of them."""
     out = []
-    if not model.known_materials.scale_is_absolute and model.reference is None:
+    if model.is_weighed:
         out.append(
             "The stiffness follows from the weight that bends the object, at the density of water and the stated size; "
-            "whatever else holds it down, such as a base that sticks, would look like a smaller modulus."
+            "whatever else holds it down, such as a base that sticks, would look like a smaller modulus. No more follows "
+            "than a lower bound, and the same is true of forces."
         )
     elif not model.known_materials.scale_is_absolute:
         out.append("Displacements alone do not give the absolute stiffness: the moduli are ratios to the material that sets the scale.")
@@ -254,6 +255,14 @@ def _undetermined(p: Parameter, model: CalibratedModel, assumed: Parameter | Non
             "'naibu compare' tells whether another law fits better."
         )
     return ""
+
+
+def _if_only_weight(p: Parameter, model: CalibratedModel) -> str:
+    """The interval of a modulus that follows from the weight of the object, if nothing else holds that on its table."""
+    if not model.is_lower_bound(p.name):
+        return ""
+    low, high = model.interval_of_model(p.name)
+    return f"{low:.3g} to {high:.3g} if nothing but its weight holds the object down"
 
 
 def _by_law(p: Parameter, model: CalibratedModel) -> str:

@@ -213,8 +213,8 @@ def _figures(a: Accuracy) -> dict[str, float | int]:
 
 
 def _reactions(model: CalibratedModel, body: Specimen, solution: Solution) -> dict[str, Any]:
-    """Forces of the rigid bodies on the object, which ratios of moduli do not tell."""
-    if model.reference is not None:
+    """Forces of the rigid bodies on the object, which ratios of moduli, or lower bounds of them, do not tell."""
+    if model.reference is not None or model.is_weighed:
         return {}
     return {"reactions_mN": {name: np.asarray(force).tolist() for name, force in body.reactions(solution).items()}}
 

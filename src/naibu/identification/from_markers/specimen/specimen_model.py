@@ -69,7 +69,8 @@ class ModelSettings:
     pixel_scale : {"given", "sought"}
         Whether the true size of a pixel along x and y is that of the file, or an unknown of every experiment.
     modulus : {"automatic", "given", "weighed"}
-        Whether a modulus that nobody states is a reference value, or sought between side plates from a weight (automatic: of known height).
+        Whether a modulus that nobody states is a reference value, or sought between side plates from a weight (automatic: of known height,
+        and as a lower bound; "weighed" states that nothing but its weight holds the object down).
     """
 
     law: str = "neo_hookean"
