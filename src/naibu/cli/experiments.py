@@ -336,7 +336,7 @@ def import_tables(
     loaded
         Tables of the loaded states, which are named after their files.
     size_mm
-        Dimensions of the object along x, y, z.
+        Dimensions of the object along x, y and z, z being its height, also where the tables have another axis upwards (vertical).
     title
         Title of the experiment.
     unit

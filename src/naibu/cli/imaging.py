@@ -225,7 +225,7 @@ def track(
     spacing_mm
         Voxel spacing along x, y, z, mm, for files that do not state it, and for positions in voxels.
     size_mm
-        Dimensions of the object along x, y, z; without them only the tables of markers are written.
+        Dimensions of the object along x, y and z, z being its height; without them only the tables of markers are written.
     title
         Title of the experiment.
     out

@@ -15,7 +15,7 @@ from naibu.core.errors import InputError
 
 # what needs numpy is imported where it is used: --help answers at once, and doctor also runs where numpy itself is broken
 if TYPE_CHECKING:
-    from naibu.core.experiment import Layer
+    from naibu.core.experiment import Layer, Loading
 
 Flag = Annotated[bool, Parameter(negative=())]
 # the options that many verbs have, with their short names
@@ -111,6 +111,8 @@ class ObjectOptions:
         What loads it.
     bar_width_mm
         Width of the bar.
+    bar_axis
+        Horizontal axis along which the bar lies, or along which the side plates press. Required for both.
     layer
         A layer of one material, 'NAME=FROM..TO' with heights from the base in mm. May be repeated.
     stated_mm
@@ -123,6 +125,7 @@ class ObjectOptions:
     shape: Literal["box", "half_ellipsoid", "cylinder", "hemisphere"] = "box"
     loading: Literal["plate", "bar", "side_plates"] = "plate"
     bar_width_mm: float | None = None
+    bar_axis: Literal["x", "y"] | None = None
     layer: Layers = None
     stated_mm: list[str] | None = None
     vertical: str | None = None
@@ -133,19 +136,33 @@ class ObjectOptions:
         Raises
         ------
         InputError
-            A layer, a height or a direction of another form.
+            A layer, a height or a direction of another form; what describes another loading, or does not describe this one.
         """
-        from naibu.core.experiment import Loading, Shape
+        from naibu.core.experiment import Shape
 
-        if self.bar_width_mm is not None and self.loading != "bar":
-            raise InputError(f"--bar-width-mm is given, but --loading is {self.loading}; give --loading bar, or leave the width out")
         return {
             "shape": Shape(self.shape, size_mm),
-            "loading": Loading(self.loading, self.bar_width_mm),
+            "loading": self._loading(),
             "layers": layers_of(self.layer or ()),
             "stated_mm": heights_of(self.stated_mm or ()),
             "vertical": direction_of(self.vertical),
         }
+
+    def _loading(self) -> Loading:
+        from naibu.core.experiment import Loading
+
+        if self.bar_width_mm is not None and self.loading != "bar":
+            raise InputError(f"--bar-width-mm is given, but --loading is {self.loading}; give --loading bar, or leave the width out")
+        if self.loading == "plate":
+            if self.bar_axis is not None:
+                raise InputError("--bar-axis is given, but --loading is plate; give --loading bar or side_plates, or leave the axis out")
+            return Loading("plate")
+        if self.loading == "bar" and self.bar_width_mm is None:
+            raise InputError("--bar-width-mm is missing: give the width of the bar, for example --bar-width-mm 13")
+        if self.bar_axis is None:
+            does = "the bar lies" if self.loading == "bar" else "the side plates press"
+            raise InputError(f"--bar-axis is missing: name the horizontal axis along which {does}, --bar-axis x or --bar-axis y")
+        return Loading(self.loading, self.bar_width_mm, self.bar_axis)
 
 
 def layers_of(texts: Sequence[str]) -> tuple[Layer, ...]:
