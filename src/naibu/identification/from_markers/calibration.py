@@ -158,7 +158,8 @@ def calibrate(
             begin, warm_starts = coarse.match.parameters.values(), coarse.warm_starts
     match = Matcher(load_cases, parameters, finding).run(progress=progress, checkpoint=checkpoint, start=begin, warm_starts=warm_starts)
     estimated = with_mesh_error and match.status is not Status.INTERRUPTED
-    mesh = mesh_error(load_cases, match, parameters, None if coarse is None else coarse.solutions) if estimated else None
+    solved = None if coarse is None else coarse.solutions
+    mesh = mesh_error(load_cases, match, parameters, solved, progress) if estimated else None
     return Calibration(load_cases, match, chosen, measured, known, parameters, mesh)
 
 

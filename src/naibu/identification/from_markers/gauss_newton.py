@@ -320,7 +320,9 @@ class Matcher:
         start: Mapping[str, float] | None = None,
         warm_starts: Mapping[str, SolvedLoadCase] | None = None,
     ) -> Match:
-        """Search for the parameters; after every accepted step `checkpoint` gets the values found so far and `progress` a report.
+        """Search for the parameters; after every accepted step `checkpoint` gets the values found so far.
+
+        `progress` gets a report before every step is tried, and after every accepted one.
 
         The search starts from the parameters' own values, or from those in `start`; `warm_starts` are solutions near the start, by the
         labels of their load cases.
@@ -347,6 +349,7 @@ class Matcher:
                 if expected < self.settings.tolerance * max(1.0, 0.01 * now.objective):
                     status = Status.CONVERGED
                     break
+                report_progress(progress, "calibration", done=iteration, objective=now.objective)  # steps may be rejected for minutes
                 found = self._try(inner, step, fits, now.objective)
                 if found is None:
                     if expected < UNEVEN * now.objective:

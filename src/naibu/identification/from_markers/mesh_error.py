@@ -17,6 +17,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.parameters import ParameterSet
+from naibu.core.progress import Progress, report_progress
 from naibu.identification.from_markers.coarse_search import COARSER
 from naibu.identification.from_markers.gauss_newton import PATH, Match, Matcher
 from naibu.identification.from_markers.observations import LoadCaseFit, MarkerLoadCase, SolvedLoadCase
@@ -61,7 +62,11 @@ class MeshError:
 
 
 def mesh_error(
-    load_cases: Sequence[MarkerLoadCase], match: Match, priors: ParameterSet, coarse: Mapping[str, SolvedLoadCase] | None = None
+    load_cases: Sequence[MarkerLoadCase],
+    match: Match,
+    priors: ParameterSet,
+    coarse: Mapping[str, SolvedLoadCase] | None = None,
+    progress: Progress | None = None,
 ) -> MeshError | None:
     """Return the discretisation error of a finished search; None where a load case cannot be solved on the second mesh.
 
@@ -75,17 +80,18 @@ def mesh_error(
         Parameters with their priors, as the search began.
     coarse : mapping of str to SolvedLoadCase, optional
         Solutions on larger elements with similar parameters, by the labels of their load cases; they save time.
+    progress : callable, optional
+        Gets a report before every load case.
     """
     values, free = match.parameters.values(), match.parameters.free
     finer = RATIO**3 * max(t.specimen.mesh.n_points for t in load_cases) <= MOST_NODES
     sizes = [element_size(t.specimen.experiment, t.specimen.settings.element_size_mm) for t in load_cases]
+    changes = []
     try:
-        changes = [
-            change_on_mesh(load_case, fit, values, size / RATIO)
-            if finer
-            else change_on_mesh(load_case, fit, values, size * RATIO, coarse[load_case.name].warm_start(values) if coarse else None)
-            for load_case, fit, size in zip(load_cases, match.fits, sizes, strict=True)
-        ]
+        for done, (load_case, fit, size) in enumerate(zip(load_cases, match.fits, sizes, strict=True)):
+            report_progress(progress, "error of the elements", done=done, total=len(load_cases))
+            known = coarse[load_case.name].warm_start(values) if coarse and not finer else None
+            changes.append(change_on_mesh(load_case, fit, values, size / RATIO if finer else size * RATIO, known))
     except (ConvergenceError, InputError):
         return None
     matcher = Matcher(load_cases, priors)
