@@ -298,10 +298,14 @@ def _add_product(inverse, rows, columns, blocks, out):  # type: ignore[no-untype
     """Add the product of the inverse between the nodes and a matrix of blocks; arrays are in the order of columns."""
     for k in range(len(rows)):
         r, c = 3 * rows[k], 3 * columns[k]
-        for j in range(3):
-            b0, b1, b2 = np.float32(blocks[k, 0, j]), np.float32(blocks[k, 1, j]), np.float32(blocks[k, 2, j])
-            for i in range(len(out)):
-                out[i, c + j] += inverse[i, r] * b0 + inverse[i, r + 1] * b1 + inverse[i, r + 2] * b2
+        b = blocks[k].astype(np.float32)
+        b00, b01, b02, b10, b11, b12 = b[0, 0], b[0, 1], b[0, 2], b[1, 0], b[1, 1], b[1, 2]
+        b20, b21, b22 = b[2, 0], b[2, 1], b[2, 2]
+        for i in range(len(out)):  # all three columns at once: what is read counts, not what is multiplied
+            first, second, third = inverse[i, r], inverse[i, r + 1], inverse[i, r + 2]
+            out[i, c] += first * b00 + second * b10 + third * b20
+            out[i, c + 1] += first * b01 + second * b11 + third * b21
+            out[i, c + 2] += first * b02 + second * b12 + third * b22
 
 
 @njit(cache=True, nogil=True, fastmath=True)
