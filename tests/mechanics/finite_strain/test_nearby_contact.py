@@ -16,7 +16,7 @@ SIZE = 30.0
 INDENTERS = [
     plane_indenter((0.0, 0.0, SIZE), (0.1, 0.2, -1.0), static_friction=0.3, kinetic_friction=0.3),
     spherical_indenter((2.0, 1.0, SIZE + 6.0), 8.0, static_friction=0.3, kinetic_friction=0.3),
-    box_indenter((2.0, 1.0, SIZE + 1.0), (10.0, 14.0, 4.0), static_friction=0.5, kinetic_friction=0.5),
+    box_indenter((2.0, 1.0, SIZE + 1.0), (10.0, 14.0, 4.0), static_friction=0.3, kinetic_friction=0.3),
     cylindrical_indenter((2.0, 1.0, SIZE + 1.0), 3.0, 20.0, axis=(1.0, 0.0, 0.3), static_friction=1.0, kinetic_friction=1.0),
 ]
 
@@ -48,7 +48,8 @@ def test_the_stiffness_is_the_derivative_of_the_forces(indenter: RigidIndenter) 
     faces = boundary_faces(mesh).faces
     whole = indenter_contacts([indenter], mesh.points, faces, normal_stiffness=500.0, tangential_stiffness=90.0)[0]
     u, pattern = displaced(mesh.n_points), block_pattern(mesh.n_points, faces)
-    anchors = whole.local(0.9 * u, 1.0)
+    still = np.arange(len(whole.nodes))[:, None] % 2 == 0
+    anchors = np.where(still, whole.local(u, 1.0), whole.local(u - 20.0 * u[::-1], 1.0))
     near = NearbyContact.of(whole, anchors, local_positions(whole, u, 1.0)[1], 1.0)
     near.add_force(u, np.zeros_like(u))
     response = whole.evaluate(u, anchors, 1.0, curvature=False)
