@@ -199,6 +199,10 @@ class ChangedInverse:
     change: BlockChange
     partner: IntArray
     counted: IntArray
+    _components: tuple[
+        IntArray, IntArray, IntArray
+    ]  # those that count, as numbers among the 3 m; of them, those in pairs, and their others
+    _place: IntArray
     _columns: NDArray[np.float32]
     _factors: tuple[NDArray[np.float32], NDArray[np.int32]]
 
@@ -208,11 +212,10 @@ class ChangedInverse:
         change, partner = _by_relative_motion(change)
         joined = np.repeat(partner >= 0, 3)
         counted = np.flatnonzero(joined | _concerned(len(change.nodes), change.rows, change.columns, change.blocks))
-        at, paired = _rows(change.nodes)[counted], np.flatnonzero(joined[counted])
+        at, paired, other = _rows(change.nodes)[counted], np.flatnonzero(joined[counted]), _rows(partner[partner >= 0])
         columns = inverse.T.take(at, axis=0).T  # contiguous both here and there: three times as fast as indices of columns
         between = columns.T.take(at, axis=1).T
         if len(paired):
-            other = _rows(partner[partner >= 0])
             columns[:, paired] -= inverse.T.take(other, axis=0).T
             between = columns.T.take(at, axis=1).T
             between[paired] -= columns.T.take(other, axis=1).T
@@ -221,29 +224,29 @@ class ChangedInverse:
         place[counted] = np.arange(len(at))
         _add_product(between, place, change.rows, change.columns, change.blocks, matrix)
         factors = la.lu_factor(matrix, overwrite_a=True, check_finite=False) if len(at) else (matrix, np.zeros(0, np.int32))
-        return cls(change, partner, counted, columns, factors)
+        return cls(change, partner, counted, (at, paired, other), place, columns, factors)
 
     def solve(self, b: FloatArray) -> FloatArray:
         """Return d (m, 3) for b (m, 3)."""
-        nodes, partner, counted = self.change.nodes, self.partner, self.counted
-        if len(counted) == 0:
+        (at, paired, other), change, flat = self._components, self.change, b.ravel()
+        if len(at) == 0:
             return b
-        both = np.flatnonzero(partner >= 0)
-        right, there = b[nodes], np.zeros((len(nodes), 3), dtype=np.float32)
-        right[both] -= b[partner[both]]
-        there.ravel()[counted] = la.lapack.sgetrs(*self._factors, right.ravel()[counted].astype(np.float32))[0]
-        reaction = np.zeros((len(nodes), 3), dtype=np.float32)
-        _react(self.change.rows, self.change.columns, self.change.blocks, there, reaction)
-        out = np.asarray(b - (self._columns @ reaction.ravel()[counted]).reshape(-1, 3))
-        if len(both) == 0:
-            out.ravel()[_rows(nodes)[counted]] = there.ravel()[counted]
-            return out
-        alone = counted[np.repeat(partner < 0, 3)[counted]]
-        out.ravel()[_rows(nodes)[alone]] = there.ravel()[alone]
-        wrong = 0.5 * (there[both] - (out[nodes[both]] - out[partner[both]]))
-        out[nodes[both]] += wrong
-        out[partner[both]] -= wrong
-        return out
+        right = flat[at]
+        if len(paired):
+            right[paired] -= flat[other]
+        there = la.lapack.sgetrs(*self._factors, right.astype(np.float32))[0]
+        reaction = np.zeros(len(at), dtype=np.float32)
+        _react(self._place, change.rows, change.columns, change.blocks, there, reaction)
+        out = flat - self._columns @ reaction
+        if len(paired) == 0:
+            out[at] = there
+            return np.asarray(out.reshape(-1, 3))
+        both = at[paired]
+        wrong = 0.5 * (there[paired] - (out[both] - out[other]))
+        sides = out[both] + wrong, out[other] - wrong
+        out[at] = there
+        out[both], out[other] = sides
+        return np.asarray(out.reshape(-1, 3))
 
 
 def _by_relative_motion(change: BlockChange) -> tuple[BlockChange, IntArray]:
@@ -292,12 +295,13 @@ def _partners(count, rows, columns, blocks):  # type: ignore[no-untyped-def]  # 
 
 
 @njit(cache=True, nogil=True)
-def _react(rows, columns, blocks, motion, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the product of a matrix of blocks and a motion (k, 3) to `reaction` (k, 3)."""
+def _react(place, rows, columns, blocks, motion, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the product of a matrix of blocks and the motion of components (c,) to `reaction` (c,); see `_add_product` for `place`."""
     for b in range(len(rows)):
-        r, c = rows[b], columns[b]
+        r, c = 3 * rows[b], 3 * columns[b]
+        m0, m1, m2 = motion[place[c]], motion[place[c + 1]], motion[place[c + 2]]
         for i in range(3):
-            reaction[r, i] += blocks[b, i, 0] * motion[c, 0] + blocks[b, i, 1] * motion[c, 1] + blocks[b, i, 2] * motion[c, 2]
+            reaction[place[r + i]] += blocks[b, i, 0] * m0 + blocks[b, i, 1] * m1 + blocks[b, i, 2] * m2
 
 
 @njit(cache=True, nogil=True)
