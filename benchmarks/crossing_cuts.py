@@ -33,17 +33,19 @@ class Times:
     """Of frames and steps, ms."""
 
     frames: list[float] = field(default_factory=list)
-    steps: list[float] = field(default_factory=list)
+    steps: list[float] = field(default_factory=list)  # of all threads
+    own: list[float] = field(default_factory=list)  # steps of the thread that takes them
     left: list[float] = field(default_factory=list)  # out of balance, %
     failed: int = 0
     under_way: bool = False
 
     def __str__(self) -> str:
         """The times in a line."""
-        ms, steps = np.array(self.frames), np.array(self.steps)
+        ms, steps, own = np.array(self.frames), np.array(self.steps), np.array(self.own)
         return (
             f"frames p99 {np.quantile(ms, 0.99):.0f}, worst {ms.max():.0f} ms; steps median {np.median(steps):.0f}, p99 "
-            f"{np.quantile(steps, 0.99):.0f}, worst {steps.max():.0f} ms, {np.count_nonzero(steps > 100.0)} of {len(steps)} above 100 ms; "
+            f"{np.quantile(steps, 0.99):.0f}, worst {steps.max():.0f} ms, {np.count_nonzero(steps > 100.0)} of {len(steps)} above 100 ms, "
+            f"of the thread that steps p99 {np.quantile(own, 0.99):.0f}, worst {own.max():.0f} ms, {np.count_nonzero(own > 100.0)} above; "
             f"out of balance at most {max(self.left):.0f} %, failed {self.failed}"
         )
 
@@ -75,7 +77,8 @@ def frame(simulation: InteractiveSimulation, times: Times) -> bool:
     taken = simulation.advance()
     times.frames.append(1e3 * (time.thread_time() - own))
     spent = 1e3 * (time.process_time() - whole)
-    times.steps[-1:] = [times.steps[-1] + spent] if times.under_way else [*times.steps[-1:], spent]
+    for steps, more in ((times.steps, spent), (times.own, times.frames[-1])):
+        steps[-1:] = [steps[-1] + more] if times.under_way else [*steps[-1:], more]
     times.left.append(100.0 * taken.unbalanced)
     times.failed += bool(taken.failed)
     times.under_way = taken.under_way

@@ -7,7 +7,7 @@ import pytest
 
 from naibu.core.arrays import FloatArray
 from naibu.mechanics import Assembler, elements, material
-from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicState
+from naibu.mechanics.finite_strain.sessions.dynamic_session import DynamicSession, DynamicState
 from naibu.meshing import box, to_tetra
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.simulation import FiniteElementBody
@@ -67,3 +67,15 @@ def test_a_body_that_is_where_it_was_when_the_blade_passed_opens_in_the_balance_
     assert forces[1][free].sum() < forces[0][free].sum()
     assert cutting._made is not None
     np.testing.assert_array_equal(opened.displacement, found.nodal(away) + cutting._made[2])
+
+
+def test_a_balance_that_newtons_method_does_not_find_is_soon_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As where a tool squeezed the body: shorter and shorter parts of a step took seconds, and found none either."""
+    tries: list[float] = []
+    monkeypatch.setattr(DynamicSession, "_found", lambda _, step, guess: tries.append(step.duration))
+    body = gel()
+    still, cutting, high = np.zeros_like(body.points), BackgroundCut(body), body.points.max(axis=0) + 5.0
+    edges = [[[x, 0.7, high[2]], [x, 0.7, 0.4]] for x in (-high[0], high[0])]
+    found = cutting.prepare(DynamicState(still, still), swept_blade(edges), None)
+    assert 0 < len(tries) <= 4 and min(tries) >= 0.05 * body.step_s
+    np.testing.assert_array_equal(cutting.result(DynamicState(still, still))[1].displacement, found.nodal(still))

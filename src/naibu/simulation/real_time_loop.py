@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from naibu.core.errors import NaibuError
 from naibu.simulation.frame import Frame
 from naibu.simulation.haptics.haptic_loop import HapticHand, require_haptic_steps
-from naibu.simulation.haptics.thread_priority import REST_S, scheduled_first
+from naibu.simulation.haptics.thread_priority import REST, scheduled_first
 from naibu.simulation.interactive_simulation import FRAME_S, InteractiveSimulation
 
 MEMORY_S = 1.0  # over which rates are averaged
@@ -87,6 +87,7 @@ class RealTimeLoop:
     _trouble: str = field(init=False, default="")
     _failure: BaseException | None = field(init=False, default=None)
     _shown: float = field(init=False, default=float("-inf"))
+    _woke: float = field(init=False, default=0.0)  # when a step for a device began
     _under_way: bool = field(init=False, default=False)  # whether the last frame left its step to the next one, which is due at once
 
     def __post_init__(self) -> None:
@@ -155,7 +156,7 @@ class RealTimeLoop:
     def _run(self) -> None:
         try:
             with nullcontext() if self.hand is None else scheduled_first():
-                due = self.clock()
+                self._woke = due = self.clock()
                 while not self._stop.is_set():
                     self._obey()
                     due = self._once(due)
@@ -164,9 +165,13 @@ class RealTimeLoop:
 
     def _once(self, due: float) -> float:
         """Make or show one frame when it is due, and return when the next one is."""
-        wait = due - self.clock()
-        if wait > 0.0 or self.hand is not None:
-            self.sleep(max(wait, REST_S))
+        now = self.clock()
+        wait = due - now
+        if self.hand is not None:
+            self.sleep(max(wait, REST * (now - self._woke)))
+            self._woke = self.clock()
+        elif wait > 0.0:
+            self.sleep(wait)
         if wait < -BEHIND_S:
             due = self.clock()
         pause = self.simulation.frame_s

@@ -16,7 +16,7 @@ SIZE = 30.0
 INDENTERS = [
     plane_indenter((0.0, 0.0, SIZE), (0.1, 0.2, -1.0), static_friction=0.3, kinetic_friction=0.3),
     spherical_indenter((2.0, 1.0, SIZE + 6.0), 8.0, static_friction=0.3, kinetic_friction=0.3),
-    box_indenter((2.0, 1.0, SIZE + 1.0), (10.0, 14.0, 4.0)),
+    box_indenter((2.0, 1.0, SIZE + 1.0), (10.0, 14.0, 4.0), static_friction=0.3, kinetic_friction=0.3),
     cylindrical_indenter((2.0, 1.0, SIZE + 1.0), 3.0, 20.0, axis=(1.0, 0.0, 0.3), static_friction=1.0, kinetic_friction=1.0),
 ]
 
@@ -39,6 +39,26 @@ def test_forces_and_gaps_are_those_of_all_points(indenter: RigidIndenter) -> Non
     np.testing.assert_allclose(force, whole.scattered(expected.force, len(u), expected.orientation), atol=1e-9)
     np.testing.assert_allclose(near.gap, expected.gap[near.points], atol=1e-12)
     np.testing.assert_allclose(near.touching().response.stiffness, expected.stiffness[expected.gap < 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize("indenter", INDENTERS, ids=[i.geometry.name for i in INDENTERS])
+def test_the_stiffness_is_the_derivative_of_the_forces(indenter: RigidIndenter) -> None:
+    """Flat faces have a kernel of their own; points stick, slip and lie beyond edges."""
+    mesh = box((SIZE, SIZE, SIZE), (6, 6, 6))
+    faces = boundary_faces(mesh).faces
+    whole = indenter_contacts([indenter], mesh.points, faces, normal_stiffness=500.0, tangential_stiffness=90.0)[0]
+    u, pattern = displaced(mesh.n_points), block_pattern(mesh.n_points, faces)
+    still = np.arange(len(whole.nodes))[:, None] % 2 == 0
+    anchors = np.where(still, whole.local(u, 1.0), whole.local(u - 20.0 * u[::-1], 1.0))
+    near = NearbyContact.of(whole, anchors, local_positions(whole, u, 1.0)[1], 1.0)
+    near.add_force(u, np.zeros_like(u))
+    response = whole.evaluate(u, anchors, 1.0, curvature=False)
+    slips = response.slip_direction[response.gap < 0.0].any(axis=1)
+    assert 0 < slips.sum() < len(slips)
+    blocks, expected = np.zeros((2, pattern.n_blocks, 3, 3))
+    near.add_stiffness(pattern, pattern.positions(whole.nodes), blocks)
+    whole.add_stiffness(response, pattern, pattern.positions(whole.nodes), expected)
+    np.testing.assert_allclose(blocks, expected, atol=1e-11 * np.abs(expected).max())
 
 
 def test_the_secant_of_friction_times_the_elastic_slip_is_the_friction() -> None:

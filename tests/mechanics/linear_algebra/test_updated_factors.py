@@ -79,6 +79,26 @@ def test_nodes_in_pairs_are_solved_by_their_relative_motion(dense: FloatArray) -
     assert len(changed.change.nodes) == 3
 
 
+def test_components_that_do_not_change_are_not_counted(dense: FloatArray) -> None:
+    """Blocks that are diagonal, or have columns of zeros, beside whole ones and a pair."""
+    random = np.random.default_rng(12)
+    some, made = np.array([0, 2, 3, 5, 7, 11]), factors_of(dense)
+    rows, columns = np.array([0, 1, 1, 2, 3, 4, 3, 4]), np.array([0, 1, 2, 1, 3, 4, 4, 3])
+    stiff = 20.0 * np.eye(3) + random.standard_normal((3, 3))
+    blocks = np.concatenate([np.zeros((4, 3, 3)), stiff[None], stiff[None], -stiff[None], -stiff[None]])
+    blocks[0], blocks[1] = np.diag([9.0, 0.0, 5.0]), np.diag([0.0, 8.0, 0.0])
+    blocks[2, :2, 1], blocks[3, 1, :2] = random.standard_normal((2, 2))  # of node 2, only component 1 is in them
+    places = np.unique(rows)
+    inverse, whole = made.between(some).astype(float), np.zeros((3 * len(some),) * 2)
+    for r, c, block in zip(rows, columns, blocks, strict=True):
+        whole[3 * r : 3 * r + 3, 3 * c : 3 * c + 3] += block
+    b = random.standard_normal((len(some), 3))
+    changed = ChangedInverse.of(made.between(some), BlockChange(places, rows, columns, blocks))
+    expected = np.linalg.solve(np.eye(len(whole)) + inverse @ whole, b.ravel())
+    np.testing.assert_allclose(changed.solve(b).ravel(), expected, atol=1e-4 * np.abs(expected).max())
+    assert len(changed.counted) == 2 + 2 + 1 + 3  # of the pair, the relative motion
+
+
 def test_a_node_that_is_in_a_pair_and_held_besides_counts_by_itself(dense: FloatArray) -> None:
     some, stiff = np.array([0, 2, 3]), 15.0 * np.eye(3)
     rows, columns = np.array([0, 1, 0, 1]), np.array([0, 1, 1, 0])

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
-from naibu.core.arrays import FloatArray
+from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.mesh import Mesh
 from naibu.meshing import BisectionForest, SweptBlade, VolumeCut, box, cut_volume, signed_volumes, swept_blade
 from naibu.meshing.cutting.earlier_fronts import front_edges
@@ -112,6 +114,28 @@ def test_a_cut_across_the_very_end_of_another_meets_it_or_it_is_said_that_it_doe
     assert met >= 23
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("turn", [0.5 * np.pi, 1.0, 0.6])
+def test_cuts_that_cross_and_end_at_one_depth_meet(seed: int, turn: float) -> None:
+    """A blade that is deeper, but ends short of the first cut, does not meet it."""
+
+    def down(x: float, depth: float, turn: float, last: float) -> SweptBlade:
+        way, aside = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+        return swept_blade([[[*(t * way + x * aside), z] for t in (-15.0, last)] for z in np.linspace(SIZE + 5.0, depth, 5)])
+
+    once = cut_volume(cubes(seed), down(0.3, 9.0, 0.0, 15.0), 2.0)
+    across = cut_volume(once.mesh, down(-0.4, 9.0, turn, 15.0), 2.0)
+    assert not len(across.bridges)
+    assert len(cut_volume(once.mesh, down(-0.4, 6.0, turn, -0.3), 2.0).bridges) > 0
+    middle = across.mesh.points[across.mesh.cells].mean(axis=1)
+    deep = middle[:, 2] > 13.0  # a layer in which four pieces are parted
+    first, second = middle[:, 1] > 0.3, middle[:, :2] @ [-np.sin(turn), np.cos(turn)] > -0.4
+    label = _pieces_of(across.mesh.cells[deep])
+    beside = (np.abs(middle[:, 1] - 0.3) > 3.0) & (np.abs(middle[:, :2] @ [-np.sin(turn), np.cos(turn)] + 0.4) > 3.0)
+    sets = [set(label[(beside & (first == a) & (second == b))[deep]]) for a in (False, True) for b in (False, True)]
+    assert not any(one & two for k, one in enumerate(sets) for two in sets[k + 1 :])
+
+
 def test_fronts_are_the_edges_at_which_a_cut_ends() -> None:
     assert not len(front_edges(BisectionForest.of(cubes(1)))[0])
     cut = cut_volume(box((SIZE, SIZE, SIZE), (4, 4, 4), cell_type="tetra"), _upright(0.0, -15.0, 0.1), 10.0)  # along faces of the mesh
@@ -121,6 +145,14 @@ def test_fronts_are_the_edges_at_which_a_cut_ends() -> None:
     assert np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).sum() >= SIZE  # from the lower to the upper face
     whole = cut_volume(cut.mesh, _upright(0.0, -15.0, 15.0), 10.0)
     assert not len(front_edges(whole.forest)[0])
+
+
+def _pieces_of(cells: IntArray) -> IntArray:
+    """Which cells hang together over faces."""
+    faces = np.sort(np.stack([np.delete(cells, k, axis=1) for k in range(4)], axis=1), axis=2).reshape(-1, 3)
+    number = np.unique(faces, axis=0, return_inverse=True)[1].ravel()
+    incidence = sp.coo_matrix((np.ones(len(faces)), (np.repeat(np.arange(len(cells)), 4), number))).tocsr()
+    return np.asarray(connected_components(incidence @ incidence.T, directed=False)[1])
 
 
 def _upright(x: float, first: float, last: float) -> SweptBlade:

@@ -184,7 +184,7 @@ class ChangedInverse:
     """Solutions d (m, 3) of ``(1 + inverse change) d = b``, with a part of the inverse of a matrix between m nodes.
 
     Nodes that a change joins in pairs, as those of the two sides of a cut, count by their relative motion alone: a small matrix of half the
-    size is factorized for them.
+    size is factorized for them. Of other nodes, components that a change does not concern do not count.
 
     Attributes
     ----------
@@ -192,10 +192,17 @@ class ChangedInverse:
         Between nodes and relative motions: its nodes are those whose motion counts, less that of the partner where there is one.
     partner : ndarray, shape (s,), int64
         The other node of a pair; -1 where a node counts by itself.
+    counted : ndarray, shape (c,), int64
+        Which of the 3 s components count.
     """
 
     change: BlockChange
     partner: IntArray
+    counted: IntArray
+    _components: tuple[
+        IntArray, IntArray, IntArray
+    ]  # those that count, as numbers among the 3 m; of them, those in pairs, and their others
+    _place: IntArray
     _columns: NDArray[np.float32]
     _factors: tuple[NDArray[np.float32], NDArray[np.int32]]
 
@@ -203,40 +210,43 @@ class ChangedInverse:
     def of(cls, inverse: NDArray[np.float32], change: BlockChange) -> ChangedInverse:
         """Factorize for a part of the inverse (3 m, 3 m), in the order of columns; the nodes of the change are places among the m."""
         change, partner = _by_relative_motion(change)
-        at, paired = _rows(change.nodes), np.flatnonzero(np.repeat(partner >= 0, 3))
+        joined = np.repeat(partner >= 0, 3)
+        counted = np.flatnonzero(joined | _concerned(len(change.nodes), change.rows, change.columns, change.blocks))
+        at, paired, other = _rows(change.nodes)[counted], np.flatnonzero(joined[counted]), _rows(partner[partner >= 0])
         columns = inverse.T.take(at, axis=0).T  # contiguous both here and there: three times as fast as indices of columns
         between = columns.T.take(at, axis=1).T
         if len(paired):
-            other = _rows(partner[partner >= 0])
             columns[:, paired] -= inverse.T.take(other, axis=0).T
             between = columns.T.take(at, axis=1).T
             between[paired] -= columns.T.take(other, axis=1).T
         matrix = np.asfortranarray(np.eye(len(at), dtype=np.float32))
-        _add_product(between, change.rows, change.columns, change.blocks, matrix)
+        place = np.zeros(len(joined), dtype=np.int64)
+        place[counted] = np.arange(len(at))
+        _add_product(between, place, change.rows, change.columns, change.blocks, matrix)
         factors = la.lu_factor(matrix, overwrite_a=True, check_finite=False) if len(at) else (matrix, np.zeros(0, np.int32))
-        return cls(change, partner, columns, factors)
+        return cls(change, partner, counted, (at, paired, other), place, columns, factors)
 
     def solve(self, b: FloatArray) -> FloatArray:
         """Return d (m, 3) for b (m, 3)."""
-        nodes, partner = self.change.nodes, self.partner
-        if len(nodes) == 0:
+        (at, paired, other), change, flat = self._components, self.change, b.ravel()
+        if len(at) == 0:
             return b
-        both = np.flatnonzero(partner >= 0)
-        right = b[nodes]
-        right[both] -= b[partner[both]]
-        there = la.lapack.sgetrs(*self._factors, right.astype(np.float32).ravel())[0].reshape(-1, 3)
-        reaction = np.zeros((len(nodes), 3), dtype=np.float32)
-        _react(self.change.rows, self.change.columns, self.change.blocks, there, reaction)
-        out = b - (self._columns @ reaction.ravel()).reshape(-1, 3)
-        if len(both) == 0:
-            out[nodes] = there
-            return np.asarray(out)
-        alone = partner < 0
-        out[nodes[alone]] = there[alone]
-        wrong = 0.5 * (there[both] - (out[nodes[both]] - out[partner[both]]))
-        out[nodes[both]] += wrong
-        out[partner[both]] -= wrong
-        return np.asarray(out)
+        right = flat[at]
+        if len(paired):
+            right[paired] -= flat[other]
+        there = la.lapack.sgetrs(*self._factors, right.astype(np.float32))[0]
+        reaction = np.zeros(len(at), dtype=np.float32)
+        _react(self._place, change.rows, change.columns, change.blocks, there, reaction)
+        out = flat - self._columns @ reaction
+        if len(paired) == 0:
+            out[at] = there
+            return np.asarray(out.reshape(-1, 3))
+        both = at[paired]
+        wrong = 0.5 * (there[paired] - (out[both] - out[other]))
+        sides = out[both] + wrong, out[other] - wrong
+        out[at] = there
+        out[both], out[other] = sides
+        return np.asarray(out.reshape(-1, 3))
 
 
 def _by_relative_motion(change: BlockChange) -> tuple[BlockChange, IntArray]:
@@ -285,23 +295,51 @@ def _partners(count, rows, columns, blocks):  # type: ignore[no-untyped-def]  # 
 
 
 @njit(cache=True, nogil=True)
-def _react(rows, columns, blocks, motion, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the product of a matrix of blocks and a motion (k, 3) to `reaction` (k, 3)."""
+def _react(place, rows, columns, blocks, motion, reaction):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the product of a matrix of blocks and the motion of components (c,) to `reaction` (c,); see `_add_product` for `place`."""
     for b in range(len(rows)):
-        r, c = rows[b], columns[b]
+        r, c = 3 * rows[b], 3 * columns[b]
+        m0, m1, m2 = motion[place[c]], motion[place[c + 1]], motion[place[c + 2]]
         for i in range(3):
-            reaction[r, i] += blocks[b, i, 0] * motion[c, 0] + blocks[b, i, 1] * motion[c, 1] + blocks[b, i, 2] * motion[c, 2]
+            reaction[place[r + i]] += blocks[b, i, 0] * m0 + blocks[b, i, 1] * m1 + blocks[b, i, 2] * m2
+
+
+@njit(cache=True, nogil=True)
+def _concerned(count, rows, columns, blocks):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Return which components of the motion of `count` nodes (3 count,) have anything but zeros in their rows and columns."""
+    found = np.zeros(3 * count, dtype=np.bool_)
+    for k in range(len(rows)):
+        for i in range(3):
+            for j in range(3):
+                if blocks[k, i, j] != 0.0:
+                    found[3 * rows[k] + i] = found[3 * columns[k] + j] = True
+    return found
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _add_product(inverse, rows, columns, blocks, out):  # type: ignore[no-untyped-def]  # pragma: no cover
-    """Add the product of the inverse between the nodes and a matrix of blocks; arrays are in the order of columns."""
+def _add_product(inverse, place, rows, columns, blocks, out):  # type: ignore[no-untyped-def]  # pragma: no cover
+    """Add the product of the inverse between components and a matrix of blocks; arrays are in the order of columns.
+
+    `place` (3 s,) are the places of all components of the nodes, 0 of those that do not count.
+    """
     for k in range(len(rows)):
         r, c = 3 * rows[k], 3 * columns[k]
-        for j in range(3):
-            b0, b1, b2 = np.float32(blocks[k, 0, j]), np.float32(blocks[k, 1, j]), np.float32(blocks[k, 2, j])
-            for i in range(len(out)):
-                out[i, c + j] += inverse[i, r] * b0 + inverse[i, r + 1] * b1 + inverse[i, r + 2] * b2
+        b = blocks[k].astype(np.float32)
+        if b[0, 1] == 0.0 and b[0, 2] == 0.0 and b[1, 0] == 0.0 and b[1, 2] == 0.0 and b[2, 0] == 0.0 and b[2, 1] == 0.0:
+            for j in range(3):
+                if b[j, j] != 0.0:
+                    alone, to, of = b[j, j], place[c + j], place[r + j]
+                    for i in range(len(out)):
+                        out[i, to] += inverse[i, of] * alone
+            continue
+        r0, r1, r2, c0, c1, c2 = place[r], place[r + 1], place[r + 2], place[c], place[c + 1], place[c + 2]
+        b00, b01, b02, b10, b11, b12 = b[0, 0], b[0, 1], b[0, 2], b[1, 0], b[1, 1], b[1, 2]
+        b20, b21, b22 = b[2, 0], b[2, 1], b[2, 2]
+        for i in range(len(out)):  # all three columns at once: what is read counts, not what is multiplied
+            first, second, third = inverse[i, r0], inverse[i, r1], inverse[i, r2]
+            out[i, c0] += first * b00 + second * b10 + third * b20
+            out[i, c1] += first * b01 + second * b11 + third * b21
+            out[i, c2] += first * b02 + second * b12 + third * b22
 
 
 @njit(cache=True, nogil=True, fastmath=True)

@@ -43,12 +43,15 @@ class EarlierFronts:
         The surface straight to the blade from those fronts near which it begins or ends, and from those that would run into it.
     joined_mm : float
         Length of these.
+    passed : ndarray, shape (k,), bool
+        Where the blade passes through the earlier cut: nothing is left between the two.
     """
 
     vertices: IntArray
     cell_mm: FloatArray
     way: SweptBlade | None
     joined_mm: float
+    passed: BoolArray
 
 
 def front_edges(forest: BisectionForest) -> tuple[IntArray, IntArray]:
@@ -75,15 +78,16 @@ def fronts_near(forest: BisectionForest, blade: SweptBlade, where: FloatArray) -
     edges, behind = front_edges(forest)
     vertices = np.unique(edges)
     if not len(vertices):
-        return EarlierFronts(vertices, np.empty(0), None, 0.0)
+        return EarlierFronts(vertices, np.empty(0), None, 0.0, np.empty(0, dtype=bool))
     gap, longest = np.empty(len(vertices)), _longest_edge(forest, vertices, where)
     distances(np.ascontiguousarray(where[vertices]), *blade.arrays, gap)
     near = gap <= REACH * longest
     vertices, longest = vertices[near], longest[near]
     known = np.isin(edges, vertices).all(axis=1)
+    passed = _passed(forest, blade, where, vertices, longest)
     edges, behind = edges[known], behind[known]
     if not len(edges):
-        return EarlierFronts(vertices, longest, None, 0.0)
+        return EarlierFronts(vertices, longest, None, 0.0, passed)
     low, high = where[vertices].min(axis=0) - longest.max(), where[vertices].max(axis=0) + longest.max()
     triangles, rim = (_within(part, low, high) for part in (blade.points[blade.triangles], _rim(blade)))
     at_rim = np.linalg.norm(_nearest(rim, where[vertices]) - where[vertices], axis=1) <= longest
@@ -95,7 +99,7 @@ def fronts_near(forest: BisectionForest, blade: SweptBlade, where: FloatArray) -
     ends = _lengthened(forest, chosen, where, vertices, REACH * longest)
     return EarlierFronts(
         vertices, longest, _way(triangles, np.concatenate([where[chosen], ends])),
-        float(np.linalg.norm(where[chosen[:, 1]] - where[chosen[:, 0]], axis=1).sum()),
+        float(np.linalg.norm(where[chosen[:, 1]] - where[chosen[:, 0]], axis=1).sum()), passed,
     )  # fmt: skip
 
 
@@ -104,7 +108,7 @@ def bridges(forest: BisectionForest, fronts: EarlierFronts, faces: IntArray) -> 
 
     Near them there are fronts still, and the cells around join most of what the earlier cut had parted. Where they do not, the front is
     that of a spur: as cuts of one blade may differ by the distance that they keep from it, so may an earlier one branch off the new one, or
-    go through it by a little.
+    go through it by a little. Where the blade passes through the earlier cut, as where two cross that end at one depth, nothing is between.
 
     Parameters
     ----------
@@ -119,23 +123,51 @@ def bridges(forest: BisectionForest, fronts: EarlierFronts, faces: IntArray) -> 
     if not len(left):
         return fronts.vertices[:0]
     closed = cKDTree(left).query(forest.points[fronts.vertices])[0] <= fronts.cell_mm
+    closed &= ~fronts.passed
     vertices, radius = fronts.vertices[closed], AROUND * fronts.cell_mm[closed]
     leaves = forest.leaves()
     around = cKDTree(forest.points[forest.simplices[leaves]].mean(axis=1)).query_ball_point(forest.points[vertices], radius)
-    lips, middle, area = _earlier_lips(forest, faces, cKDTree(forest.points[vertices]), radius.max(initial=0.0))
-    beside = cKDTree(middle).query_ball_point(forest.points[vertices], radius)
+    if not len(vertices):
+        return vertices
+    lips, corners, area = _earlier_lips(forest, faces, cKDTree(forest.points[vertices]), radius.max())
+    beside = cKDTree(forest.points[corners].mean(axis=1)).query_ball_point(forest.points[vertices], radius)
     joined = [_joined(forest, leaves[cells], lips[rows], area[rows]) for cells, rows in zip(around, beside, strict=True)]
     return np.asarray(vertices[np.array(joined, dtype=bool)])
 
 
-def _earlier_lips(forest: BisectionForest, faces: IntArray, near: cKDTree, radius: float) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Pairs of cells (p, 2) on both sides of cuts but the last one, of faces (f, 4), and the middles and areas of the smaller faces."""
+def _passed(forest: BisectionForest, blade: SweptBlade, where: FloatArray, vertices: IntArray, cell_mm: FloatArray) -> BoolArray:
+    """Whether the sides of earlier cuts lie on both sides of the blade around vertices of fronts (k,), and beside it, not beyond its rim.
+
+    A cut that the blade goes on from, or along, lies within `REACH` of cells (k,), mm, of it.
+    """
+    if not len(vertices):
+        return np.empty(0, dtype=bool)
+    radius = AROUND * cell_mm
+    none = np.empty((0, 4), dtype=np.int64)
+    middle = where[_earlier_lips(forest, none, cKDTree(forest.points[vertices]), radius.max())[1]].mean(axis=1)
+    if not len(middle):
+        return np.zeros(len(vertices), dtype=bool)
+    low, high = middle.min(axis=0) - radius.max(), middle.max(axis=0) + radius.max()
+    foot, at_rim = (_nearest(_within(part, low, high), middle) for part in (blade.points[blade.triangles], _rim(blade)))
+    beside = np.linalg.norm(foot - at_rim, axis=1) > FOLDED * blade.extent_mm
+    height = np.where(beside, ((middle - foot) * blade.normals_near(middle)).sum(axis=1), 0.0)
+    around = cKDTree(middle).query_ball_point(where[vertices], radius)
+    reached = np.array([[height[rows].min(initial=0.0), height[rows].max(initial=0.0)] for rows in around])
+    passed = (reached[:, 0] < -REACH * cell_mm) & (reached[:, 1] > REACH * cell_mm)
+    if not passed.any():
+        return np.asarray(passed)
+    return np.asarray(cKDTree(where[vertices[passed]]).query(where[vertices])[0] <= radius)  # between two cuts that cross at a small angle
+
+
+def _earlier_lips(forest: BisectionForest, faces: IntArray, near: cKDTree, radius: float) -> tuple[IntArray, IntArray, FloatArray]:
+    """Pairs of cells (p, 2) on both sides of cuts but the last one, of faces (f, 4), and the vertices and areas of the smaller faces."""
     boundary = forest.boundary_faces()[0]
     new = np.concatenate([faces[:, :2], faces[:, 2:]]) @ [4, 1]
     boundary = boundary[~np.isin(boundary @ [4, 1], new)]
-    corners = forest.points[_face_vertices(forest, boundary)]
+    vertices = _face_vertices(forest, boundary)
+    corners = forest.points[vertices]
     close = near.query(corners.mean(axis=1))[0] <= radius
-    boundary, corners = boundary[close], corners[close]
+    boundary, vertices, corners = boundary[close], vertices[close], corners[close]
     middle, normal = corners.mean(axis=1), np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1)
     area = np.linalg.norm(normal, axis=1)
@@ -150,7 +182,7 @@ def _earlier_lips(forest: BisectionForest, faces: IntArray, near: cKDTree, radiu
     apart = np.abs(((middle[two] - a) * normal[one]).sum(axis=1)) / area[one]
     lie = (share >= 0.0).all(axis=0) & (apart <= FOLDED * size[one])
     one, two = one[lie], two[lie]
-    return np.stack([boundary[one, 0], boundary[two, 0]], axis=1), middle[two], area[two]
+    return np.stack([boundary[one, 0], boundary[two, 0]], axis=1), vertices[two], area[two]
 
 
 def _joined(forest: BisectionForest, cells: IntArray, lips: IntArray, area: FloatArray) -> bool:

@@ -21,6 +21,7 @@ from naibu.simulation.interactive_bodies import AnySession, FiniteElementBody, I
 
 CUT_STAGES = ("separating the mesh", "bringing volume strains to balance", "factorizing the stiffness", "lifting the tool")
 PART = 0.1  # of a step, in which volume strains come to balance
+DIVISIONS = 2  # of that part: where a tool squeezes the body, it finds none in shorter ones either, and they take most of the time
 SHARES = (0.0, 0.25, 0.5, 1.0)  # of the way to that balance that are tried, as the body may have moved on since it was found
 
 
@@ -152,7 +153,9 @@ def _settled(body: FiniteElementBody, behind: DynamicState) -> FloatArray:
     """
     e, settled = body.engine, behind.displacement
     for assembler in (with_friction(e.assembler, 0.0), e.assembler) if e.assembler.unsymmetric else (e.assembler,):
-        newton = DynamicEngine(e.points, assembler, e.mass, e.faces, PART * e.step, e.normal_stiffness, e.tangential_stiffness)
+        newton = DynamicEngine(
+            e.points, assembler, e.mass, e.faces, PART * e.step, e.normal_stiffness, e.tangential_stiffness, divisions=DIVISIONS
+        )
         with suppress(NaibuError), closing(replace(body, engine=newton).session()) as session:  # whoever steps it next is told
             session.restore(DynamicState(settled, np.zeros_like(settled)))
             session.step(body.grip_velocity(np.zeros(3)), [])

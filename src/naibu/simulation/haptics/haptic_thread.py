@@ -10,7 +10,7 @@ from typing import Self
 
 from naibu.simulation.haptics.haptic_loop import HapticHand
 from naibu.simulation.haptics.local_contact import LocalContact
-from naibu.simulation.haptics.thread_priority import REST_S, scheduled_first
+from naibu.simulation.haptics.thread_priority import REST, scheduled_first
 from naibu.simulation.interactive_simulation import InteractiveSimulation
 from naibu.simulation.real_time_loop import RealTimeLoop
 
@@ -56,10 +56,12 @@ class HapticThread:
     def _run(self) -> None:
         try:
             with scheduled_first():
-                due = self.clock()
+                woke = due = self.clock()
                 while not self._stop.is_set():
-                    wait = due - self.clock()
-                    self.sleep(max(wait, REST_S))
+                    now = self.clock()
+                    wait = due - now
+                    self.sleep(max(wait, REST * (now - woke)))
+                    woke = self.clock()
                     if wait < -BEHIND_S:
                         due = self.clock()
                     self.step()

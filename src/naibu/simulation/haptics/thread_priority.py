@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 from naibu.core.cores import usable_cores
 
-REST_S = 1.2e-4  # least rest of a step of a thread that is scheduled first: Linux stops those that take more than 95 % of a core for 50 ms
+REST = 0.06  # of the time of a step: what a thread that is scheduled first rests at least; Linux stops for 50 ms what takes 95 % of a core
 
 
 @contextmanager

@@ -137,6 +137,32 @@ def test_points_of_stiff_and_soft_bodies_that_stick_and_slip_by_turns_find_their
     assert solved >= 34
 
 
+class RoundedWall(Wall):
+    """The same, at motions that are known to a millionth of a millimetre only: as where the motion of a body as a whole is large."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.evaluations, self.changes = 0, 0
+
+    def __call__(self, motion: FloatArray) -> FloatArray:
+        self.evaluations += 1
+        return super().__call__(motion + 1e-6 * np.sin(1e9 * motion))
+
+    def change(self, *, exact: bool = False) -> BlockChange:
+        self.changes += 1
+        return super().change(exact=exact)
+
+
+def test_a_search_ends_where_only_rounding_is_left() -> None:
+    """A light body lies on a stiff wall: forces differ by more than they should, and no evaluation or matrix makes that less."""
+    count, weight = 12, 0.5  # mN
+    condensed = CondensedContact(factorized(BODY * np.eye(3 * count)), np.arange(count), np.full(count, BODY))
+    free, law = np.tile([0.0, 0.0, GAP + weight / BODY], (count, 1)), RoundedWall()
+    force = found_by(condensed.forces(free, law, np.zeros_like(free), 0.05, 10.0, 1e-9))
+    assert law.changes <= 3 and law.evaluations <= 20
+    np.testing.assert_allclose(force[:, 2], -weight, atol=0.02)  # of a stiffness of 1e4 mN/mm
+
+
 class RoughWallOfThen(RoughWall):
     """The same, beside a tangent in which all nodes touched it: they are those that springs hold back where no forces are found."""
 

@@ -109,6 +109,7 @@ def test_the_contact_of_an_iteration_of_a_part_is_sought_for_a_twentieth_of_a_se
     for module in (real_time_session, condensed_contact):
         monkeypatch.setattr(module, "time", clock)
     monkeypatch.setattr(condensed_contact._Search, "_consistent", lambda *_: False)
+    monkeypatch.setattr(condensed_contact._Floor, "reached", lambda *_: False)
     monkeypatch.setattr(ChangedInverse, "of", factorized)
     monkeypatch.setattr(CondensedContact, "forces", counted)
     monkeypatch.setattr(RealTimeSession, "_quasi_newton", in_parts)

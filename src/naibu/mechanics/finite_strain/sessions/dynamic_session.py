@@ -103,6 +103,8 @@ class DynamicEngine:
         Newton iterations of a step at most.
     tolerance : float
         A step ends before where the residual is below this fraction of the forces.
+    divisions : int
+        How often a step is tried that Newton's method does not solve: whole, in two parts, in four, and so on.
 
     Raises
     ------
@@ -119,13 +121,14 @@ class DynamicEngine:
     tangential_stiffness: float = 200.0
     iterations: int = 10
     tolerance: float = 1e-3
+    divisions: int = SUBDIVISIONS
     _extent: float = field(init=False)
     _modulus: float = field(init=False)
     _shear: FloatArray = field(init=False)  # moduli of the elements at every node
 
     def __post_init__(self) -> None:
         require_shape("mass", self.mass, (len(self.points),))
-        for name in ("step", "normal_stiffness", "tangential_stiffness", "iterations", "tolerance"):
+        for name in ("step", "normal_stiffness", "tangential_stiffness", "iterations", "tolerance", "divisions"):
             require_positive(name, float(getattr(self, name)))
         if not self.mass.min() > 0.0:
             raise InputError(f"mass must be positive at every node, not {self.mass.min():g} kg; remove nodes that no element uses")
@@ -209,7 +212,7 @@ class DynamicSession(IndenterSession[DynamicEngine, DynamicState]):
     ) -> tuple[FloatArray, FloatArray]:
         """Take one step, in parts where it does not converge or is too fast; returns the mean forces of bodies and indenters, mN."""
         before, first = self.reached, self._parts(moving, along, spin)
-        for level in range(SUBDIVISIONS):
+        for level in range(self.engine.divisions):
             parts = first * 2**level
             h = self.engine.step / parts
             found = []

@@ -51,6 +51,8 @@ LEFT = 0.5  # of the work at the beginning of such a step: what may be left at i
 SEARCHED = 8  # ends of a step that are tried
 UNMOVED, IDLE = 0.01, 3  # change of what is left in two such steps, and how many in a row change it by no more before they are given up
 ENOUGH = 0.005  # likewise, where no further matrix is worth while
+ROUNDED = 0.1  # of the tolerance: what is left below it, and no longer falls by half in so many evaluations, is rounding
+AT_FLOOR = 3
 
 
 class ContactLaw(Protocol):
@@ -242,6 +244,7 @@ class _Search:
             body._changed, body._held_by = None, body._share
         at = best = begun = self._tried(begin)
         evaluations, changes, steps, cut_short, mixing = 1, 0, 0, 0, AndersonMixing(DEPTH)
+        floor = _Floor(ROUNDED * self.tolerance_mm)
         useless, exact, slips = body._changed is None, False, law.slips
         while evaluations < EVALUATIONS:
             if at.size <= self.tolerance_mm * (1.0 if evaluations < USUAL else 10.0) and self._consistent(at, BALANCED):
@@ -260,7 +263,7 @@ class _Search:
                 body._changed, changes = ChangedInverse.of(body._inverse, change), changes + 1
                 begun, steps, mixing = at, 0, AndersonMixing(DEPTH)
             step = mixing.step(at.motion.ravel(), -body._changed.solve(at.left).ravel()).reshape(-1, 3)
-            share = min(1.0, self.longest_mm / float(np.abs(step).max()))
+            share = min(1.0, self.longest_mm / max(float(np.abs(step).max()), 1e-300))
             cut_short += share < 1.0
             before, at = at, self._tried(at.motion + share * step)
             evaluations, steps = evaluations + 1, steps + 1
@@ -273,6 +276,8 @@ class _Search:
                 at, slips = best, False
             if at.size < best.size:
                 best = at
+            if floor.reached(at.size):
+                return best, True
         return best, False
 
     def _downhill(self, at: _Motion, most: int) -> Generator[None, None, tuple[_Motion, bool]]:
@@ -283,6 +288,7 @@ class _Search:
         motion is ``y = free + W f``, which a whole step determines.
         """
         law, nodes, best, exerted, idle, sizes = self.law, len(self.body.nodes), at, None, 0, [np.inf, at.size]
+        floor = _Floor(ROUNDED * self.tolerance_mm)
         for _ in range(most):
             if time.thread_time() > self.until or idle == IDLE:
                 break
@@ -307,6 +313,8 @@ class _Search:
             idle = idle + 1 if abs(at.size - sizes[-3]) <= UNMOVED * at.size else 0
             if at.size <= 10.0 * self.tolerance_mm and self._consistent(at, ENOUGH):
                 return at, True
+            if floor.reached(at.size):
+                return best, True
         return best, False
 
     def _least(self, motion: FloatArray, exerted: FloatArray, step: FloatArray, further: FloatArray, most: float) -> float:
@@ -342,6 +350,25 @@ class _Search:
         if np.isnan(at.apart):
             at.apart = float(np.abs(self._forces(at.motion - at.left) - at.force).sum())
         return at.apart <= fraction * (min(float(np.abs(at.force).sum()), at.exerted) + self.faint_mn)
+
+
+@dataclass(slots=True, eq=False)
+class _Floor:
+    """Tells where what is left of an equation no longer falls, mm, far below what is sought.
+
+    The inverse has single precision. Where stiff contacts press hard against each other, and together exert next to nothing, what rounding
+    leaves of the motion is more than their forces may differ by, and neither evaluations nor matrices make it less.
+    """
+
+    below: float
+    least: float = np.inf
+    idle: int = 0
+
+    def reached(self, size: float) -> bool:
+        """Take note of what is left, mm, and say whether it has stayed."""
+        self.idle = self.idle + 1 if 0.5 * self.least < size <= self.below else 0
+        self.least = min(self.least, size)
+        return self.idle == AT_FLOOR
 
 
 @dataclass(slots=True, eq=False)

@@ -276,6 +276,7 @@ def motion_in_threes(sides: ApproachingLips | None, motion: FloatArray) -> list[
 def change_in_threes(change: FloatArray, first: int) -> BlockChange:
     """Return the change of stiffnesses (p,), mN/mm, as that of rows of three, of which row `first` is the first one."""
     rows = in_threes(change)
-    some = np.flatnonzero((np.abs(rows) > UNCHANGED * np.abs(rows).max(initial=0.0)).any(axis=1))
+    rows[np.abs(rows) <= UNCHANGED * np.abs(rows).max(initial=0.0)] = 0.0
+    some = np.flatnonzero(rows.any(axis=1))
     places = np.arange(len(some))
     return BlockChange(first + some, places, places, rows[some][:, :, None] * np.eye(3))
