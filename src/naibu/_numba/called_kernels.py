@@ -19,6 +19,7 @@ from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler_lock import global_compiler_lock
 
 from naibu._numba import shortcuts
+from naibu._numba.frame_stack import with_room
 
 Compiler = Callable[[Any, Any], Any]
 
@@ -124,11 +125,12 @@ def compiled_for(called: bool, kernel: Any, compile: Compiler, args: Any, return
     """
     compiler = kernel._compiler
     compiler._customize_flags = _without_wrappers if called else _without_wrapper_for_c
-    faster = contextlib.nullcontext() if being_called() else shortcuts.taken()
+    outermost = not being_called()
+    faster = shortcuts.taken() if outermost else contextlib.nullcontext()
     _Nesting.depth += 1
     try:
         with libraries(CalledLibrary if called else _LibrariesOf(kernel)), _uncollected(), faster:
-            result = compile(args, return_type)
+            result = with_room(lambda: compile(args, return_type)) if outermost else compile(args, return_type)
     finally:
         _Nesting.depth -= 1
         del compiler._customize_flags
