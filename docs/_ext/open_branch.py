@@ -1,7 +1,7 @@
 """The sidebar shows the branch of the page that is open, and of all others the first level.
 
-The theme asks for the whole tree on each page: of the hundreds of pages of the API that was the most of the time of a build, and of the size
-of a page.
+The theme asks for the whole tree on each page: of the hundreds of pages of the API that was the most of the time of a build, and of the
+size of a page.
 """
 
 from __future__ import annotations
