@@ -30,6 +30,7 @@ extensions = [
     "benchmark_plots",
     "benchmark_results",
     "naibu_help",
+    "open_branch",
     "public_names",
 ]
 bibtex_bibfiles = ["references.bib"]

@@ -10,7 +10,7 @@ from naibu.identification.from_markers.calibration import Calibration, calibrate
 from naibu.identification.from_markers.known_materials import KnownMaterials
 from naibu.identification.from_markers.specimen.parameter_names import young_modulus
 from naibu.identification.from_markers.specimen.specimen_model import ModelSettings
-from naibu.validation.specimens.marker_phantoms import Scanner, box_experiment, two_gels, virtual_specimen
+from naibu.validation.specimens.marker_phantoms import Scanner, VirtualSpecimen, box_experiment, two_gels, virtual_specimen
 
 
 @cache
@@ -34,15 +34,20 @@ def identified(element_size_mm: float, *, stated_mm: float = 30.0, with_mesh_err
 
 
 @cache
+def gel(number: int, factor: float) -> VirtualSpecimen:
+    """Return the first or second of two gels, the second upside down, with a soft layer that is stiffer by `factor`."""
+    template = box_experiment(
+        ("one", "two")[number], (60.0,) * 3, [(m, 30.0) for m in ("soft", "stiff")[:: (1, -1)[number]]], Loading("plate"),
+        {"pressed": (46.0, 48.0)[number]},
+    )  # fmt: skip
+    truth = two_gels(46.0)[1]
+    values = truth | {young_modulus("soft"): truth[young_modulus("soft")] * factor}
+    return virtual_specimen(template, values, settings=ModelSettings(element_size_mm=60.0 / 11, contact="stick"))
+
+
+@cache
 def identified_together(factor: float, *, seed: int = 0) -> Calibration:
     """Identify two virtual gels, one upside down, as one pair of materials; the soft one of the second is stiffer by `factor`."""
-    layers = ("soft", "stiff")
-    truth = two_gels(46.0)[1]
-    made = []
-    for k, (name, order) in enumerate((("one", layers), ("two", layers[::-1]))):
-        experiment = box_experiment(name, (60.0,) * 3, [(m, 30.0) for m in order], Loading("plate"), {"pressed": (46.0, 48.0)[k]})
-        values = truth | {young_modulus("soft"): truth[young_modulus("soft")] * (1.0, factor)[k]}
-        body = virtual_specimen(experiment, values, settings=ModelSettings(element_size_mm=60.0 / 11, contact="stick"))
-        made.append(body.scanned(seed=2 * seed + k, scanner=Scanner()).experiment)
-    settings = ModelSettings(element_size_mm=60.0 / 8, contact="stick")
-    return calibrate(made, known_materials=KnownMaterials({"stiff": truth[young_modulus("stiff")]}), settings=settings)
+    made = [gel(k, (1.0, factor)[k]).scanned(seed=2 * seed + k, scanner=Scanner()).experiment for k in range(2)]
+    settings, stiff = ModelSettings(element_size_mm=60.0 / 8, contact="stick"), two_gels(46.0)[1][young_modulus("stiff")]
+    return calibrate(made, known_materials=KnownMaterials({"stiff": stiff}), settings=settings)

@@ -19,6 +19,7 @@ from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler_lock import global_compiler_lock
 
 from naibu._numba import shortcuts
+from naibu._numba.frame_stack import with_room
 
 Compiler = Callable[[Any, Any], Any]
 
@@ -43,6 +44,10 @@ class CalledLibrary(JITCodeLibrary):
         """Take in code, but for a wrapper for Python, which Numba makes of the body of each parallel loop."""
         if ir_module.name != WRAPPER:
             super().add_ir_module(ir_module)
+        for function in ir_module.functions:  # its parts know one another: only a search for cycles would free them
+            for block in function.blocks:
+                block.instructions.clear()
+            function.blocks.clear()
 
     def _optimize_final_module(self) -> None:
         """Leave the code to the optimisation of the kernel for Python: at each level of calls, all levels below were optimised again."""
@@ -51,6 +56,16 @@ class CalledLibrary(JITCodeLibrary):
         self._finalize_dynamic_globals()
         self._verify_declare_only_symbols()
         self._finalized = True
+
+    def _get_module_for_linking(self) -> Any:
+        """Return the code, as that of Numba does, without making a copy of what is only linked."""
+        self._ensure_finalized()
+        if self._shared_module is None:
+            self._shared_module = self._final_module
+            for function in self._final_module.functions:
+                if not function.is_declaration and function.linkage == llvm.Linkage.external:
+                    function.linkage = "linkonce_odr"
+        return self._shared_module
 
     def get_pointer_to_function(self, name: str) -> int:
         """Return 0, the address of no function."""
@@ -124,11 +139,12 @@ def compiled_for(called: bool, kernel: Any, compile: Compiler, args: Any, return
     """
     compiler = kernel._compiler
     compiler._customize_flags = _without_wrappers if called else _without_wrapper_for_c
-    faster = contextlib.nullcontext() if being_called() else shortcuts.taken()
+    outermost = not being_called()
+    faster = shortcuts.taken() if outermost else contextlib.nullcontext()
     _Nesting.depth += 1
     try:
         with libraries(CalledLibrary if called else _LibrariesOf(kernel)), _uncollected(), faster:
-            result = compile(args, return_type)
+            result = with_room(lambda: compile(args, return_type)) if outermost else compile(args, return_type)
     finally:
         _Nesting.depth -= 1
         del compiler._customize_flags

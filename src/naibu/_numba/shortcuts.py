@@ -7,10 +7,11 @@ They take the place of functions of Numba while a kernel of naibu is compiled (`
   calls are nested, each of some ten thousand calls of LLVM told all levels of it;
 - options of a compilation are compared as they were set, not option by option through a property each;
 - variables of a statement are listed by what is known of the types of its parts;
-- how an operator acts on numbers is found once, not for each place where it stands: some twenty templates are tried each time;
+- how an operator acts on numbers and arrays is found once, not for each place where it stands: some twenty templates are tried each time;
 - which variables are alive at each block's begin is found for those who ask, which are generators and compilations for the interpreter;
 - what was registered with Numba is gone through again when there is more of it, not once more for each kernel that is called;
 - the size of a plain type is asked of LLVM once;
+- whether a function of Numba takes a place in the source as an argument is read from its code, not from a signature made of it each time;
 - wrappers for callers in C are not made of those functions of Numba that kernels call.
 """
 
@@ -18,6 +19,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from types import FunctionType
 from typing import Any
 
 from numba.core import analysis, base, event, ir, lowering, postproc, targetconfig, transforms, types
@@ -33,13 +35,14 @@ _refresh_typing: Any = typing_context.BaseContext.refresh
 _find_size: Any = base.BaseContext.get_abi_sizeof
 _wrap_for_c: Any = lowering.BaseLower.create_cfunc_wrapper
 _hash_of_names: Any = targetconfig.TargetConfig.__hash__  # the same for all configurations of a class
+_takes_place: Any = base._has_loc
 _NUMBERS = (types.Integer, types.Float, types.Boolean, types.IntegerLiteral, types.BooleanLiteral)
 
 _defaults: dict[type, dict[str, Any]] = {}
 _hashes: dict[type, int] = {}
 _adders: dict[type, Callable[[Any, list[Any]], object]] = {}
-_numbers: dict[Any, bool] = {}
-# what acts on numbers, by the identities of function and context, which are kept with it, and types
+_plain: dict[Any, bool] = {}
+# what acts on numbers and arrays, by the identities of function and context, which are kept with it, and types
 _found: dict[tuple[int, int, tuple[Any, ...]], tuple[Any, Any, Any]] = {}
 # how much was registered with a context when it was refreshed, by its identity; it is kept with it, as the layout of data is
 _registered: dict[int, tuple[Any, int]] = {}
@@ -73,6 +76,7 @@ def _substitutes(config: Any) -> tuple[tuple[Any, str, Any], ...]:
         (typing_context.BaseContext, "refresh", _refreshed_typing),
         (base.BaseContext, "get_abi_sizeof", _size),
         (lowering.BaseLower, "create_cfunc_wrapper", _wrapped_for_c),
+        (base, "_has_loc", _takes_place_in_source),
     )
 
 
@@ -135,15 +139,15 @@ def _add_those_of_items(items: Any, found: list[Any]) -> None:
         _add_variables(item, found)
 
 
-def _is_number(kind: Any) -> bool:
-    known = _numbers.get(kind)
+def _is_plain(kind: Any) -> bool:
+    known = _plain.get(kind)
     if known is None:
-        known = _numbers[kind] = isinstance(kind, _NUMBERS)
+        known = _plain[kind] = isinstance(kind, (*_NUMBERS, types.Array)) or (isinstance(kind, types.UniTuple) and _is_plain(kind.dtype))
     return known
 
 
 def _call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
-    if kws or not all(map(_is_number, args)):
+    if kws or not all(map(_is_plain, args)):
         return _find_call_type(self, context, args, kws)
     key = (id(self), id(context), tuple(args))
     known = _found.get(key)
@@ -224,3 +228,10 @@ def _size(self: Any, kind: Any) -> int:
 def _wrapped_for_c(self: Any) -> None:
     if not getattr(self.library, LINKED_ONLY, False):
         _wrap_for_c(self)
+
+
+def _takes_place_in_source(function: Any) -> bool:
+    if type(function) is not FunctionType or vars(function):  # attributes of a decorator may stand for another signature
+        return bool(_takes_place(function))
+    code = function.__code__
+    return "loc" in code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
