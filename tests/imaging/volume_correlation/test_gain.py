@@ -21,7 +21,8 @@ def local_gain(noise: float, gain: float, texture: Array) -> Array:
     mask = np.ones(texture.shape, dtype=bool)
     level = ImageLevel(before.astype(np.float32), after.astype(np.float32), mask, np.ones(3), (1, 1, 1), 0.0)
     value, weight = after[mask].astype(np.float32), np.ones(mask.sum(), np.float32)
-    return GainMap(level, 12.0).local(value, weight, 2.0 * (gain * noise) ** 2)[0]
+    lattice = GainMap(level, 12.0)
+    return lattice.values(lattice.local(value, weight, 2.0 * (gain * noise) ** 2))[0]
 
 
 @pytest.mark.parametrize("noise", [0.05, 0.6, 1.0])

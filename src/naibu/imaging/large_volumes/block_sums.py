@@ -18,6 +18,7 @@ from naibu.imaging.large_volumes.thinning import ThinnedValues
 from naibu.imaging.preprocessing.field_of_view import Box
 from naibu.imaging.preprocessing.volume_pair import shifted_intensity
 from naibu.imaging.volume_correlation.common_content import content_sums
+from naibu.imaging.volume_correlation.gain_coupling import CoupledGain
 from naibu.imaging.volume_correlation.gauss_newton import CorrelationFit
 from naibu.imaging.volume_correlation.image_level import ENOUGH, MARGIN, GainMap, ImageLevel
 from naibu.imaging.volume_correlation.residual_noise import lagged_products
@@ -99,6 +100,8 @@ class ComparedBlock:
         z, y, x of the cells.
     matrix, load, draws : ndarray, shape (k, 3, 1029), (k, 3) and (k, 3, s)
         Of the intensities alone: normal matrix, load, random loads.
+    coupled : CoupledGain, optional
+        What the gain shares with the displacement; of a step where gain is local.
     agreement, misfit, content : ndarray, shape (m, 12), (m, 3) and (m, 13)
         See `CorrelationFit.cell_agreement`, `CorrelationFit.cell_misfit` and `content_sums`.
     products, pairs : ndarray
@@ -120,6 +123,7 @@ class ComparedBlock:
     matrix: Float32Array
     load: Float32Array
     draws: Float32Array
+    coupled: CoupledGain | None
     agreement: FloatArray
     misfit: FloatArray
     content: FloatArray
@@ -161,6 +165,9 @@ def compared_block(
     soft, seen = ~part.rigid[part.mask], int(fit.seen.sum())
     jitter = fit.observed_jitter_voxels**2 * seen if state.stage == "step" else 0.0
     misfit = fit.cell_misfit()
+    curvature = fit.curvature_share if state.stage == "step" else None
+    if curvature is not None and not state.draws:  # random fields have loads of the weights themselves
+        fit.products *= curvature[:, None]
     for values in (fit.products, fit.force, fit.gradient):
         values[~soft] = 0
     m = len(fit.system.cells)
@@ -175,6 +182,7 @@ def compared_block(
         seen, len(fit.value), _classes(fit), jitter, fit.robust_sums, _moments(fit), *gain,
         np.stack(fit.system.nodes, axis=1) + first[::-1], fit.system.cells[:, 2:] + first[::-1],
         fit.system.matrix if solving else fit.system.matrix[:0], load, _random_loads(fit, part.mask, state, block),
+        None if curvature is None or not fit.settings.gain_cell_mm else fit.coupled_gain(fit.lattice),
         fit.cell_agreement(), misfit, content_sums(fit, part.depth(fit.level)) if at_end else np.zeros((m, 0)),
         products, pairs,
         _small_blocks(fit, part, state.tiles, state.draws, soft) if at_end and state.tiles else None,

@@ -28,7 +28,7 @@ class Schedule:
     @property
     def adapted(self) -> int:
         """The one in which weights are adapted."""
-        return self.rough + (2 if self.rough else 3)
+        return self.rough + (2 if self.rough else 4)
 
     @property
     def least(self) -> int:

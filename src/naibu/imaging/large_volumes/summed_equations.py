@@ -24,6 +24,7 @@ from naibu.imaging.preprocessing.morphology import dilated
 from naibu.imaging.preprocessing.object_mask import object_threshold
 from naibu.imaging.volume_correlation.common_content import content_of, require_convergence, require_overlap
 from naibu.imaging.volume_correlation.correlate import ADAPTATION_SAMPLES, ADAPTATIONS, UNSETTLED, Correlation
+from naibu.imaging.volume_correlation.gain_coupling import CoupledGain, GainCoupling
 from naibu.imaging.volume_correlation.gauss_newton import (
     COVARIANCE_TOLERANCE,
     REGULAR,
@@ -178,18 +179,22 @@ class SummedEquations:
         """Return the model after a Gauss-Newton step with the sums of all blocks, and weights adapted to them."""
         sums, coarse = self._added(blocks), self.coarse
         before, passes, plan = self.model.coefficients, self.model.passes + 1, self.schedule
+        found = self._with_intensities(sums)
+        self._couple(sums, found.gain)
         coarse.c, coarse.bending, coarse.dilatation = before.copy(), self.model.bending, self.model.dilatation
         self.system.ratio = self.model.ratio  # of an interrupted run, too
         self._settle(sums, before)
         if self.adapting and passes == plan.adapted:
             self._adapt(sums, before)
         self._settle(sums, before)
-        found = self._with_intensities(sums)
+        if sums.coupled is not None:
+            followed = sums.coupled.followed((coarse.c - before)[self.system.active].astype(np.float32))
+            found = replace(found, gain=self.model.gain + sums.coupled.gain_step + followed)
         steps = MixedSteps() if plan.is_first_of_its_kind(passes) else deepcopy(self.model.steps)
         found = replace(found, gain=self._mixed(sums, steps, before, found.gain))
         self._take_step(before)
         jitter = self.model.jitter_voxels
-        if self.adapting and passes == plan.adapted - 1:
+        if self.adapting and passes in (plan.adapted - 1, plan.adapted + 1):  # and once more nearer to the end
             jitter = self.fit.bounded_jitter(float(np.sqrt(sums.jitter / sums.seen)))
         return replace(
             found, jitter_voxels=jitter, coefficients=coarse.c, bending=coarse.bending,
@@ -258,8 +263,7 @@ class SummedEquations:
     def _mixed(self, sums: _Sums, steps: MixedSteps, before: FloatArray, gain: FloatArray) -> FloatArray:
         """Mix the step from coefficients `before`, and that to a `gain`, with earlier ones; return the gain.
 
-        Blocks are compared at a gain that was matched in the pass before, so that displacement and gain converge only together. Either is
-        weighed by what it changes of the intensities.
+        Either is weighed by what it changes of the intensities.
         """
         active, last = self.system.active, self.model.gain
         step = (self.coarse.c - before)[active].astype(np.float32)
@@ -271,21 +275,32 @@ class SummedEquations:
         self.coarse.c[active] += taken[: step.size].reshape(step.shape)
         return last + taken[step.size :]
 
+    def _couple(self, sums: _Sums, gain: FloatArray) -> None:
+        """Let the sums solve for displacement and local gain together, given the gain of robust regression."""
+        if len(sums.shared):
+            regression, at = (sums.gain_matrix, self.model.residual_sd**2, self._everywhere(sums)), self.system.middles_mm
+            shared = CoupledGain(sums.shared, sums.newton_gain)
+            sums.coupled = GainCoupling(self.system, shared, at / self.coarse.spacing, self.lattice, regression, gain - self.model.gain)
+
     def _take_step(self, before: FloatArray) -> None:
         """Let the fit judge which cells still move: a tenth of a voxel of the volume, not of the coarse one."""
         self.fit.last_step = (self.coarse.c - before)[self.system.active].astype(np.float32)
         self.fit.still_mm = STILL * float(np.prod(self.frame.spacing) ** (1.0 / 3.0))
 
     def _with_intensities(self, sums: _Sums) -> Model:
-        w, f, g, ff, gg = sums.moments
-        mean_f, mean_g = f / max(w, 1e-30), g / max(w, 1e-30)
-        spread, wanted = gg - w * mean_g**2, ff - w * mean_f**2
-        gain = float(np.clip(np.sqrt(max(wanted, 0.0) / max(spread, 1e-30)), *GAIN_RANGE))
-        everywhere = gain, mean_f - gain * mean_g, float(np.sqrt(max(spread, 0.0) / max(w, 1e-30)))
+        everywhere = self._everywhere(sums)
         sd = self._residual_sd(sums.classes)
         reliability = self.fit.reliability_of(sums.agreement)
         found = self._gain(sums.gain_matrix, sums.gain_load, self.model.residual_sd, everywhere)
         return replace(self.model, gain=found, residual_sd=sd, reliability=reliability)
+
+    def _everywhere(self, sums: _Sums) -> tuple[float, float, float]:
+        """Return one gain and offset for all voxels, and the SD of the intensities."""
+        w, f, g, ff, gg = sums.moments
+        mean_f, mean_g = f / max(w, 1e-30), g / max(w, 1e-30)
+        spread, wanted = gg - w * mean_g**2, ff - w * mean_f**2
+        gain = float(np.clip(np.sqrt(max(wanted, 0.0) / max(spread, 1e-30)), *GAIN_RANGE))
+        return gain, mean_f - gain * mean_g, float(np.sqrt(max(spread, 0.0) / max(w, 1e-30)))
 
     def _gain(self, matrix: FloatArray, load: FloatArray, sd: float, everywhere: tuple[float, float, float]) -> FloatArray:
         if not self.fit.settings.gain_cell_mm:
@@ -315,12 +330,15 @@ class SummedEquations:
         gone[:-1] = (coarse.c - about)[system.active]
         back = np.empty((system.n, 3), np.float32)
         product(sums.matrix, system.neighbours, gone, back)
+        if sums.coupled is not None:
+            back += sums.coupled.load(sums.coupled.gain_step) - sums.coupled.lost(gone[:-1])
         return np.asarray(right + sums.load - back)
 
     def _settle(self, sums: _Sums, about: FloatArray, steps: int = 1) -> None:
         """Solve for the coefficients with the present weights; each step leaves a seventh of what the one before left."""
         for _ in range(steps):
-            step, _ = self.system.solved(self._assembled(sums, about), STEP_TOLERANCE)
+            lost = None if sums.coupled is None else sums.coupled.lost
+            step, _ = self.system.solved(self._assembled(sums, about), STEP_TOLERANCE, lost=lost)
             self.coarse.c = self.coarse.c.copy()
             self.coarse.c[self.system.active] += step
 
@@ -370,6 +388,8 @@ class _Sums:
         self.draws, self.content = np.zeros((nodes, 3, 0), np.float32), np.zeros((cells, 0))
         self.gain_matrix, self.gain_load, self.products, self.pairs = (np.zeros(()) for _ in range(4))
         self.small: list[BlockSums] = []
+        self.coupled: GainCoupling | None = None
+        self.shared, self.newton_gain = np.zeros((0, 64, 3, 2), np.float32), np.zeros(())
 
     def add(self, block: ComparedBlock, nodes: IntArray, cells: IntArray) -> None:
         """Add a block whose nodes and cells have these numbers."""
@@ -387,6 +407,11 @@ class _Sums:
         self.matrix[nodes] += block.matrix
         self.load[nodes] += block.load
         self.draws[nodes] += block.draws
+        if block.coupled is not None:
+            if not len(self.shared):
+                self.shared = np.zeros((self.cells, *block.coupled.loads.shape[1:]), np.float32)
+            self.shared[cells] += block.coupled.loads
+            self.newton_gain = self.newton_gain + block.coupled.matrix
         self.agreement[cells] += block.agreement
         self.misfit[cells] += block.misfit
         self.content[cells] += block.content

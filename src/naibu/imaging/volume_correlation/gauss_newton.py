@@ -15,7 +15,8 @@ from scipy import ndimage
 
 from naibu.core.arrays import AnyFloatArray, BoolArray, Float32Array, FloatArray, IntArray
 from naibu.imaging.volume_correlation._warp_kernels import add_to_cells, shrink_gradients
-from naibu.imaging.volume_correlation.image_level import ImageLevel
+from naibu.imaging.volume_correlation.gain_coupling import CoupledGain, GainCoupling
+from naibu.imaging.volume_correlation.image_level import GainMap, ImageLevel, most_probable_gain
 from naibu.imaging.volume_correlation.intensity_comparison import ComparisonSettings, IntensityComparison
 from naibu.imaging.volume_correlation.mixed_steps import MixedSteps
 from naibu.imaging.volume_correlation.residual_noise import ResidualNoise
@@ -141,8 +142,13 @@ class CorrelationFit(IntensityComparison):
             if times.anchoring:
                 first = self.displacement.copy() if first is None else first
                 self.anchor(first, times.anchoring)
+            coupling = self.coupling() if times.mixed and self.settings.gain_cell_mm else None
+            if coupling is not None:
+                self.products *= self.curvature_share[:, None]
             load = self.system.assembled(c, self.products, self.force, bending, dilatation)
-            step, _ = self.system.solved(load, times.tolerance)
+            if coupling is not None:
+                load -= coupling.load(coupling.gain_step)
+            step, _ = self.system.solved(load, times.tolerance, lost=None if coupling is None else coupling.lost)
             moved = self.system.at_middles(step)
             length = np.linalg.norm(moved, axis=1)
             far = float(np.percentile(length, 95))
@@ -165,6 +171,22 @@ class CorrelationFit(IntensityComparison):
             shrink_gradients(self.reliability, self.cell_of_voxel, self.weight, self.residual, self.gradient, self.products, self.force)
         for inclusion in self.inclusions:
             inclusion.follow(self)
+
+    def coupled_gain(self, lattice: GainMap) -> CoupledGain:
+        """Return what gain and offset on a lattice share with the displacement."""
+        curvature = self.curvature_share
+        pull = self.gradient * (self.weight * curvature)[:, None]
+        loads = self.system.cell_loads(np.stack([pull * self.value[:, None], pull], axis=2))
+        return CoupledGain(loads, lattice.normal_equations(self.value, self.robust_weight * curvature)[0])
+
+    def coupling(self) -> GainCoupling:
+        """Return how displacement and local gain are coupled."""
+        lattice, variance = GainMap(self.level, self.settings.gain_cell_mm), self.residual_sd**2
+        everywhere = lattice.everywhere(self.value, self.robust_weight)
+        matrix, load = lattice.normal_equations(self.value, self.robust_weight)
+        to_gain = most_probable_gain(matrix, load, variance, everywhere) - self.local_gain
+        at = self.system.middles_mm / self.level.spacing
+        return GainCoupling(self.system, self.coupled_gain(lattice), at, lattice, (matrix, variance, everywhere), to_gain)
 
     def windowed(self, values: FloatArray, width: float) -> FloatArray:
         """Return values (m, ...) of the cells summed in a Gaussian window of a standard deviation in cells."""

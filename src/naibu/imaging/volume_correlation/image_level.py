@@ -157,10 +157,10 @@ class GainMap:
         gain = float(np.clip(np.sqrt(wanted / max(spread, 1e-30)), *GAIN_RANGE))
         return gain, mean_f - gain * mean_g, float(np.sqrt(spread / total))
 
-    def local(self, value: Float32Array, weight: Float32Array, variance: float) -> tuple[Float32Array, Float32Array]:
-        """Return gain and offset (n,) at the listed voxels, the most probable ones given the residual's variance."""
+    def local(self, value: Float32Array, weight: Float32Array, variance: float) -> FloatArray:
+        """Return the most probable gain and offset (2 k,) at the points of the lattice, given the residual's variance."""
         matrix, load = self.normal_equations(value, weight)
-        return self.values(most_probable_gain(matrix, load, variance, self.everywhere(value, weight)))
+        return most_probable_gain(matrix, load, variance, self.everywhere(value, weight))
 
     def normal_equations(self, value: Float32Array, weight: Float32Array) -> tuple[FloatArray, FloatArray]:
         """Return the matrix (2 k, 2 k) of gain and offset at the k points of the lattice, and loads (k, 3): `most_probable_gain`."""
@@ -168,6 +168,14 @@ class GainMap:
         left, right = np.zeros((2, 2 * n, 2 * n)), np.zeros((2, n, 3))
         gain_normal_equations(self.level.intensity, value, weight, self.level.index, self.low, self.step, self.n, left, right)
         return left.sum(axis=0), right.sum(axis=0)
+
+    def corners(self, at: FloatArray) -> tuple[IntArray, FloatArray]:
+        """Return the points (n, 8) of the lattice about voxel indices x, y, z (n, 3), and their trilinear weights; clipped to it."""
+        t = np.clip((at - self.low) / self.step, 0.0, self.n - 1.0)
+        cell = np.minimum(t.astype(np.int64), self.n - 2)
+        far = np.array([[q & 1, (q >> 1) & 1, q >> 2] for q in range(8)])
+        point = (cell[:, None] + far) @ np.array([1, self.n[0], self.n[0] * self.n[1]])
+        return point, np.prod(np.where(far == 1, (t - cell)[:, None], 1.0 - (t - cell)[:, None]), axis=2)
 
     def values(self, solution: FloatArray) -> tuple[Float32Array, Float32Array]:
         """Return gain and offset (n,) at the listed voxels from those of the lattice (2 k,)."""
@@ -196,14 +204,19 @@ def most_probable_gain(matrix: FloatArray, load: FloatArray, variance: float, ev
     edges, where it is largest: an object that moves rigidly swelled by up to a per cent in much noise. The part of the equations due to
     noise, as large in both volumes, has the gain of all voxels instead: a ratio of standard deviations, which is not diluted.
     """
-    gain, offset, spread = everywhere
-    n = len(load)
-    first = np.tile([gain, offset], n)
-    prior = np.tile([(GAIN_SD * gain) ** -2, (GAIN_SD * gain * max(spread, 1e-30)) ** -2], n)
+    gain, offset, _ = everywhere
+    first = np.tile([gain, offset], len(load))
     root = np.sqrt(np.minimum(_noise_variance(matrix, load), variance / (2.0 * gain**2)))
     both = load[:, :2].ravel() - matrix @ first
     both[::2] += gain * root * (matrix[1::2, 1::2] @ root)
-    return np.asarray(first + linalg.solve(matrix / variance + np.diag(prior), both / variance, assume_a="pos"))
+    return np.asarray(first + linalg.solve(gain_curvature(matrix, variance, everywhere), both / variance, assume_a="pos"))
+
+
+def gain_curvature(matrix: FloatArray, variance: float, everywhere: tuple[float, float, float]) -> FloatArray:
+    """Return the matrix (2 k, 2 k) of gain and offset with their prior; arguments as of `most_probable_gain`."""
+    gain, _, spread = everywhere
+    prior = np.tile([(GAIN_SD * gain) ** -2, (GAIN_SD * gain * max(spread, 1e-30)) ** -2], len(matrix) // 2)
+    return np.asarray(matrix / variance + np.diag(prior))
 
 
 def _noise_variance(matrix: FloatArray, load: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ MAD = 1.4826  # standard deviation of a normal distribution, in median absolute 
 # quantiles of the gradient between classes of voxels, of which there are enough, and fewest voxels
 CLASSES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0)
 ENOUGH, LEAST_SEEN = 200_000, 1200
+LEAST_CURVATURE = 0.3  # empirical, on textured balls: robust weights of large residuals curve the other way
 ROUNDING = 1e-6  # least residual SD, of the intensity range: identical volumes would divide by zero
 
 
@@ -64,6 +65,8 @@ class IntensityComparison:
         Standard deviation of the residual, robust once the volumes are nearly registered.
     jitter_voxels : float
         Sub-voxel jitter SD, voxels: that of the settings, or a smaller one that the residuals tell.
+    local_gain : ndarray, shape (2 k,)
+        Gain and offset at the points of their lattice, where they are local.
     """
 
     def __init__(self, level: ImageLevel, settings: ComparisonSettings) -> None:
@@ -74,7 +77,7 @@ class IntensityComparison:
         self.products, self.agreement = np.zeros((n, 6), np.float32), np.zeros((n, 12), np.float32)
         self.gain, self.offset = np.ones(n, np.float32), np.zeros(n, np.float32)
         self.robust_weight, self.residual_sd = np.ones(n, np.float32), 0.0
-        self.jitter_voxels = settings.jitter_sd_voxels
+        self.jitter_voxels, self.local_gain = settings.jitter_sd_voxels, np.zeros(0)
 
     @property
     def seen(self) -> BoolArray:
@@ -88,7 +91,8 @@ class IntensityComparison:
             self.gain[:], self.offset[:], _ = gain.everywhere(self.value, self.robust_weight)
             self._update_residual_sd(seen)
         if self.settings.gain_cell_mm:
-            self.gain, self.offset = gain.local(self.value, self.robust_weight, self.residual_sd**2)
+            self.local_gain = gain.local(self.value, self.robust_weight, self.residual_sd**2)
+            self.gain, self.offset = gain.values(self.local_gain)
         self._update_residual_sd(seen)
 
     def weigh(self) -> None:
@@ -109,6 +113,13 @@ class IntensityComparison:
         # with q = sqrt(w / w at r = 0): the derivative of r q^2 is q^2 (4 q - 3)
         q = 1 / (1 + (self.residual.astype(float) / (self.settings.robust * self.residual_sd)) ** 2)
         return float(w.sum()), float((w * (4 * q - 3)).sum())
+
+    @property
+    def curvature_share(self) -> Float32Array:
+        """Derivatives (n,) of weight times residual, over the weight, `LEAST_CURVATURE` or more: what Newton's method has of a weight."""
+        # with q = sqrt(w / w at r = 0): the derivative of r q^2 is q^2 (4 q - 3)
+        q = 1 / (1 + (self.residual / np.float32(self.settings.robust * self.residual_sd)) ** 2)
+        return np.asarray(np.maximum(4 * q - 3, np.float32(LEAST_CURVATURE)), dtype=np.float32)
 
     def bounded_jitter(self, observed_voxels: float) -> float:
         """Return the sub-voxel jitter to weigh by, voxels, given the observed one: never more than the settings say."""

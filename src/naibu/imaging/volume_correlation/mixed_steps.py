@@ -12,8 +12,8 @@ DEPTH = 2  # deeper ones gain nothing: empirical, on textured balls
 class MixedSteps:
     """Anderson acceleration :cite:p:`walker2011` of steps, from what they change.
 
-    Gain and offset are matched between Gauss-Newton steps rather than with them, and robust weights follow the residuals: by themselves
-    such steps leave a large part of an error that gain and displacement share.
+    Robust weights follow the residuals, and the matrix has their curvature only in part: by themselves such steps leave a share of an
+    error.
 
     Parameters
     ----------

@@ -82,6 +82,38 @@ def test_deviations_hold_along_an_axis_that_is_less_rough_or_noisier_than_the_ot
     assert (np.mean(ratio, axis=0) < 1.45).all(), ratio
 
 
+def half_lost_twice(noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return two states of a bulging cloud that each lost half of it, of which a quarter is left in both, and the numbers of particles.
+
+    `noise` is that of a coordinate in a state, in distances between the particles before the loss.
+    """
+    rng, n = np.random.default_rng(5), 2500
+    x = rng.uniform(0.0, 20.0, (n, 3))
+    sd = noise * 20.0 / n ** (1.0 / 3.0)
+    first, second = np.flatnonzero(rng.random(n) < 0.5), rng.permutation(np.flatnonzero(rng.random(n) < 0.5))
+    seen = [v + sd * rng.standard_normal(v.shape) for v in (x[first], (x + bulging(x))[second])]
+    return seen[0], seen[1], first, second
+
+
+def test_half_of_the_particles_may_be_lost_in_both_states() -> None:
+    x, y, first, second = half_lost_twice(0.02)
+    found = particle_motion(x, y)
+    here, there = found.links.pairs.T
+    right = first[here] == second[there]
+    assert right.mean() >= 0.995 and right.sum() > 0.97 * len(np.intersect1d(first, second))
+    assert found.links.confidence.mean() < right.mean() + 0.005
+
+
+def test_where_noise_hides_which_particle_is_which_probabilities_say_so() -> None:
+    """By noise of a twentieth, within which other particles lie, too; clouds with noise of a tenth are refused."""
+    x, y, first, second = half_lost_twice(0.05)
+    found = particle_motion(x, y)
+    here, there = found.links.pairs.T
+    assert found.links.confidence.mean() < (first[here] == second[there]).mean()
+    with pytest.raises(InputError, match="no common structure"):
+        particle_motion(*half_lost_twice(0.1)[:2])
+
+
 def test_stated_deviations_are_raised_where_residuals_are_larger() -> None:
     x, y, _ = affine(800, 2, (0.02, 0.02, 0.02))
     honest = np.full(x.shape, 0.02 / np.sqrt(2.0))

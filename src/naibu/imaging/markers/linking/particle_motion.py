@@ -18,7 +18,7 @@ from naibu.imaging.markers.linking.point_clouds import local_spacing
 from naibu.imaging.markers.linking.point_matching import Links, link_markers
 from naibu.imaging.markers.settings import LinkSettings, require_between
 
-# Empirical values, judged by tests/imaging/markers/test_particle_motion.py.
+# Empirical values, judged by tests/imaging/markers/linking/test_particle_motion.py.
 FLAT = 0.05  # ratio of the extents of neighbours below which they lie in a plane or on a line, and tell no strain across it
 ROUNDS = 3  # of the robust fit
 CORE = 3.0  # medians within which residuals tell the noise

@@ -122,6 +122,18 @@ def add_forces(
                 scatter(load, cell, slot, loads)
 
 
+@njit(cache=True, parallel=True, fastmath=True, error_model="numpy")
+def cell_forces(cells: AnyArray, forces: AnyArray, which: AnyArray, starts: Any, weights: Any, out: AnyArray) -> None:
+    """Fill out (m, 64, 3 s) with the loads of forces (voxels, 3 s) in every cell on its nodes."""
+    many = forces.shape[1]
+    for m in prange(len(cells)):
+        f1, f2, box = np.empty((4, many), F), np.empty((16, many), F), np.empty(6, np.int64)
+        for a in range(3):
+            box[2 * a], box[2 * a + 1] = starts[a][cells[m, 4 - a]], starts[a][cells[m, 4 - a] + 1]
+        clear(out[m])
+        _add_forces(forces, which, box, weights[0], weights[1], weights[2], f1, f2, out[m])
+
+
 @njit(cache=True, fastmath=True, error_model="numpy")
 def _add_dilatation(cof: AnyArray, gradients: AnyArray, t: Any, draws: AnyArray, load: AnyArray) -> None:
     """Add t times draws (s,) of the dilatation at a Gauss point with gradients (3, 64) to load (64, 3 s)."""

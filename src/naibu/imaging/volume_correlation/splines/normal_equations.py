@@ -5,7 +5,7 @@ Samples are drawn by perturbing data and penalties, and solving :cite:p:`papandr
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from itertools import islice
 
 import numpy as np
@@ -16,7 +16,7 @@ from naibu.imaging.volume_correlation._warp_kernels import warp_voxels
 from naibu.imaging.volume_correlation.image_level import ImageLevel
 from naibu.imaging.volume_correlation.splines._assembly_kernels import ALONG, LINE, PRODUCTS, SLICE, assemble
 from naibu.imaging.volume_correlation.splines._sample_kernels import add_random_forces, products_of_many
-from naibu.imaging.volume_correlation.splines._spline_kernels import add_forces, add_noise, product, sample_energies
+from naibu.imaging.volume_correlation.splines._spline_kernels import add_forces, add_noise, cell_forces, product, sample_energies
 from naibu.imaging.volume_correlation.splines.spline_grid import SplineGrid, separable
 
 INSIDE = 0.5  # empirical: fraction of a cell in the object above which its dilatation is penalised
@@ -136,9 +136,7 @@ class SplineSystem:
         """Return the field (k, 3) of coefficients (n, 3) in the middles of the cells that lie in the object, or of every cell."""
         full = np.zeros((*self.active.shape, 3))
         full[self.active] = coefficients
-        return self.grid.values(
-            full, self.grid.origin_mm + (self.cells[slice(None) if every else self.inner][:, :1:-1] + 0.5) * self.grid.step_mm
-        )
+        return self.grid.values(full, self.middles_mm[slice(None) if every else self.inner])
 
     def warped(
         self, c: FloatArray, value: Float32Array, reference_gradient: Float32Array, gradient: Float32Array, displacement: Float32Array
@@ -191,12 +189,19 @@ class SplineSystem:
         products_of_many(matrix, self.neighbours, x, out)
         return np.ascontiguousarray(out[:, :, :given])
 
-    def solved(self, load: Float32Array, tolerance: float, most: int = 100) -> tuple[Float32Array, int]:
-        """Return A^-1 load (n, 3) by conjugate gradients, preconditioned by blocks of nodes, and the number of iterations."""
-        x, steps = self.solved_many(load[:, :, None], tolerance, most)
+    def solved(
+        self, load: Float32Array, tolerance: float, most: int = 100, lost: Callable[[Float32Array], Float32Array] | None = None
+    ) -> tuple[Float32Array, int]:
+        """Return A^-1 load (n, 3) by conjugate gradients, preconditioned by blocks of nodes, and the number of iterations.
+
+        From products (n, 3) of the matrix with coefficients (n, 3), `lost` of these is taken away.
+        """
+        x, steps = self.solved_many(load[:, :, None], tolerance, most, lost)
         return x[:, :, 0], steps
 
-    def solved_many(self, loads: Float32Array, tolerance: float, most: int = 100) -> tuple[Float32Array, int]:
+    def solved_many(
+        self, loads: Float32Array, tolerance: float, most: int = 100, lost: Callable[[Float32Array], Float32Array] | None = None
+    ) -> tuple[Float32Array, int]:
         """Return A^-1 loads (n, 3, s), all at once, and the number of iterations."""
         n, given = self.n, loads.shape[2]
         single = given == 1
@@ -213,7 +218,12 @@ class SplineSystem:
                 product(self.matrix, self.neighbours, p[:, :, 0], ap[:, :, 0])
             else:
                 products_of_many(self.matrix, self.neighbours, p, ap)
-            alpha = (rz / np.maximum(_dot(p[:n], ap), 1e-30)).astype(np.float32)
+            if lost is not None:
+                ap[:, :, 0] -= lost(p[:n, :, 0])
+            curved = _dot(p[:n], ap)
+            if lost is not None and curved[0] <= 0.0:  # rounding took more than there was
+                return self.solved_many(loads, tolerance, most)
+            alpha = (rz / np.maximum(curved, 1e-30)).astype(np.float32)
             x += alpha * p[:n]
             r -= alpha * ap
             z = self.preconditioned(r)
@@ -275,6 +285,24 @@ class SplineSystem:
         flat = forces.reshape(len(forces), 3 * forces.shape[2])  # also of no voxel
         add_forces(loads.reshape(self.n, -1), self.tasks, self.cells, self.slot, flat, which, self.starts, self.weights)
         return loads
+
+    def cell_loads(self, forces: Float32Array) -> Float32Array:
+        """Return loads (m, 64, 3, s) of forces (voxels, 3, s) on the nodes of every cell from its own voxels."""
+        out = np.empty((len(self.cells), 64, 3 * forces.shape[2]), np.float32)
+        flat = forces.reshape(len(forces), 3 * forces.shape[2])
+        cell_forces(self.cells, flat, self.level.number, self.starts, self.weights, out)
+        return out.reshape(len(self.cells), 64, 3, -1)
+
+    @property
+    def cell_nodes(self) -> IntArray:
+        """Numbers (m, 64) of the nodes of every cell."""
+        (z, y, x), a = self.cells[:, 2:].T[..., None], np.arange(64)
+        return np.asarray(self.slot[z + (a >> 4), y + ((a >> 2) & 3), x + (a & 3)])
+
+    @property
+    def middles_mm(self) -> FloatArray:
+        """Middles (m, 3) of the cells, mm."""
+        return np.asarray(self.grid.origin_mm + (self.cells[:, :1:-1] + 0.5) * self.grid.step_mm)
 
     def random_loads(self, sensitivity: Float32Array, random: Iterable[Float32Array], number: Int32Array | None = None) -> Float32Array:
         """Return loads (n, 3, s) of the forces that random numbers (voxels,) times the sensitivity (voxels, 3) are, one load for each.
