@@ -79,7 +79,7 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
     best : Point
         The best fit of the fields as they are.
     of_law : float
-        By how much chi squared falls with the shape of the law free, or with a border that slides.
+        By how much chi squared falls with the shape of the law free, a border that slides, or another place of the free surface.
     variance : float
         Of whitened residuals over that stated, errors that neighbours share counted.
     bounds : Bounds
