@@ -165,7 +165,7 @@ def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
     of_young = OTHER_YOUNG / region.young_modulus_sd if region.young_modulus_sd > 0.0 else 0.0
     of_poisson = abs(near - poisson) / region.poisson_ratio_sd if region.poisson_ratio_sd > 0.0 else 0.0
     stiffer = (1.0 + OTHER_YOUNG) * young
-    other_ratio = (f"with Poisson's ratio {near:.3g} for {poisson:.3g} of {region.name!r}", young, near, of_poisson)
+    other_ratio = (f"with Poisson's ratio {near:.4g} for {poisson:.4g} of {region.name!r}", young, near, of_poisson)
     if region.is_unit:
         return [other_ratio]
     return [(f"with {stiffer:.4g} kPa for {young:.4g} kPa of {region.name!r}", stiffer, poisson, of_young), other_ratio]
