@@ -35,6 +35,7 @@ from naibu.identification.from_fields.surface.bias import LEFT, without_bias
 from naibu.identification.from_fields.surface.noise import SurfaceNoise
 from naibu.identification.from_fields.surface.skewness import distances_of_bounds
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals
+from naibu.identification.from_fields.verdicts.discrepancy import doubt_of_model
 from naibu.identification.from_fields.verdicts.statement import statement
 from naibu.identification.from_fields.verdicts.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
 from naibu.identification.from_fields.verdicts.within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
@@ -92,6 +93,7 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     test = ScoreTest.of(found.at, found.quadratic, finer)
     ratios = asked_ratios(test, variance, found.stretch)
     judged, thin = _judged(fit, found, settings)
+    explained = judged
     of_elements, coarse = _of_elements(fit, found, settings, judged, thin)
     total = found.of_noise.with_added(of_known + doubt_of_ratios(ratios, len(of_known))).with_law(law)
     total = total if of_elements is None else total.with_added(of_elements)
@@ -106,7 +108,9 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     whole = Fitted(test, fit.point, variance, found.stretch, found.size.residuals, found.misfit - fit.freedom, settings.bounds)
     causes = OtherCauses.asked(whole, judged, 0.0 if free is None else free.fall, ratios, of_map=fit.refined is not None)
     judged = causes.judged(judged, model.zones, theta, total, coarse=coarse)
-    total = total.with_added(causes.covariance(len(theta)))
+    accounted = max(causes.accounted, 0.0 if law is None or free is None else free.fall)
+    of_model = doubt_of_model(explained, found.information, found.misfit - fit.freedom, accounted)
+    total = total.with_added(causes.covariance(len(theta)) + of_model * np.outer(found.stretch, found.stretch))
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))
     budget = ErrorBudget(found.of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), found.shared)
@@ -143,6 +147,8 @@ class _Measured:
         On the mesh, and at vanishing element size.
     bias, taken : ndarray, shape (2 count,)
         What of the bias is left, and all of it that is taken off the best fit.
+    information : ndarray, shape (2 count, 2 count)
+        Fisher information of the moduli for the stated noise.
     """
 
     point: Point
@@ -156,6 +162,7 @@ class _Measured:
     of_noise: Uncertainty
     bias: FloatArray
     taken: FloatArray
+    information: FloatArray
 
     @classmethod
     def of(cls, fit: RegionFit, settings: EstimateSettings) -> _Measured:
@@ -178,7 +185,7 @@ class _Measured:
         stretch = stretch_of(np.zeros_like(size.theta) if size.shift is None or fit.corrected is not None else size.shift)
         bias = score.left(noise.information)
         taken = fit.point.theta - point.theta + bias
-        return cls(point, at, quadratic, size, stretch, misfit, shared, of_noise, of_noise.stretched(stretch), bias, taken)
+        return cls(point, at, quadratic, size, stretch, misfit, shared, of_noise, of_noise.stretched(stretch), bias, taken, noise.information.matrix)
 
 
 def _size(fit: RegionFit, settings: EstimateSettings, at: Linearised, quadratic: Concentrated, noise: SurfaceNoise) -> SizeCorrection:

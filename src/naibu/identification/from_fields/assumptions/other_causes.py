@@ -30,6 +30,8 @@ from naibu.identification.from_fields.inversion.gauss_newton import Bounds
 from naibu.identification.from_fields.uncertainty import Uncertainty
 from naibu.identification.verdict import Verdict
 
+BY_CHANCE = 3.0  # standard deviations of chi squared that noise leaves
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fitted:
@@ -59,6 +61,13 @@ class Fitted:
     residuals: Sequence[FloatArray]
     beyond_noise: float
     bounds: Bounds
+
+    @property
+    def by_elements(self) -> float:
+        """By how much chi squared falls with elements of half the size, where these leave no more than noise does; 0 where they do."""
+        misfit = sum(float(r @ r) for r in self.residuals)
+        by_chance = BY_CHANCE * float(np.sqrt(2.0 * max(misfit - self.beyond_noise, 0.0)))
+        return max(0.0, self.point.misfit - misfit) if self.beyond_noise <= by_chance else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +103,12 @@ class OtherCauses:
         """By how much chi squared falls at least with a cause that comes first: more than with another law, and by half of what is left."""
         return max(self.of_law, EXPLAINS * self.beyond_noise)
 
+    @property
+    def accounted(self) -> float:
+        """By how much chi squared falls with the one that explains most of those of which `covariance` holds the effect."""
+        each = [one.fall for one in (*self.ratios, self.scaling, self.sliding, self.surface) if one is not None]
+        return max([*each, *(one.gain for one in self.readings if one.likelier)], default=0.0)
+
     @classmethod
     def asked(cls, fit: Fitted, judged: Verdict, of_law: float, ratios: tuple[AskedRatio, ...], *, of_map: bool) -> OtherCauses:
         """Ask for each of them.
@@ -115,7 +130,7 @@ class OtherCauses:
         sliding, surface = (None, None) if of_map else (asked_sliding(test, variance, stretch), asked_surface(test, variance, stretch))
         of_geometry = max((one.fall for one in (sliding, surface) if one is not None), default=0.0)
         scaling = unless_explained(asked_scaling(test, variance, stretch), judged, of_law, of_geometry)
-        readings = other_readings(test.at.model, fit.point, max(of_law, of_geometry), variance, fit.bounds)
+        readings = other_readings(test.at.model, fit.point, max(of_law, of_geometry), fit.by_elements, variance, fit.bounds)
         of_law = max(of_law, *[one.fall for one in ratios]) if ratios else of_law
         explained = max(of_law, EXPLAINS * fit.beyond_noise)
         averages = None if of_geometry > explained else averages  # neighbours share what a jump or a wrong surface leaves as well
