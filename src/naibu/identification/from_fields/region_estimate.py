@@ -185,7 +185,8 @@ class _Measured:
         stretch = stretch_of(np.zeros_like(size.theta) if size.shift is None or fit.corrected is not None else size.shift)
         bias = score.left(noise.information)
         taken = fit.point.theta - point.theta + bias
-        return cls(point, at, quadratic, size, stretch, misfit, shared, of_noise, of_noise.stretched(stretch), bias, taken, noise.information.matrix)
+        stretched, information = of_noise.stretched(stretch), noise.information.matrix
+        return cls(point, at, quadratic, size, stretch, misfit, shared, of_noise, stretched, bias, taken, information)
 
 
 def _size(fit: RegionFit, settings: EstimateSettings, at: Linearised, quadratic: Concentrated, noise: SurfaceNoise) -> SizeCorrection:

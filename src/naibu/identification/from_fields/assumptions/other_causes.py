@@ -12,6 +12,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray
 from naibu.identification.from_fields.assumptions.averaged_displacements import Averaging, averaging, judged_averages
+from naibu.identification.from_fields.assumptions.eigenstrain import Eigenstrain, asked_eigenstrain, judged_eigenstrain
 from naibu.identification.from_fields.assumptions.free_surface import SurfacePlace, asked_surface, judged_surface
 from naibu.identification.from_fields.assumptions.known_ratios import AskedRatio, judged_ratios
 from naibu.identification.from_fields.assumptions.other_readings import Reading, covariance_of_readings, judged_readings, other_readings
@@ -22,7 +23,7 @@ from naibu.identification.from_fields.assumptions.scaled_displacements import (
     judged_scaling,
     unless_explained,
 )
-from naibu.identification.from_fields.assumptions.score_test import ScoreTest
+from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
 from naibu.identification.from_fields.assumptions.sliding_borders import Sliding, asked_sliding, judged_sliding
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Point
@@ -87,6 +88,7 @@ class OtherCauses:
     scaling : Scaling or None
     sliding : Sliding or None
     surface : SurfacePlace or None
+    eigenstrain : Eigenstrain or None
     """
 
     of_law: float
@@ -97,6 +99,7 @@ class OtherCauses:
     scaling: Scaling | None
     sliding: Sliding | None
     surface: SurfacePlace | None
+    eigenstrain: Eigenstrain | None
 
     @property
     def explained(self) -> float:
@@ -104,9 +107,17 @@ class OtherCauses:
         return max(self.of_law, EXPLAINS * self.beyond_noise)
 
     @property
+    def _each(self) -> tuple[Averaging | Scaling | Sliding | SurfacePlace | Eigenstrain | None, ...]:
+        return self.averages, self.scaling, self.sliding, self.surface, self.eigenstrain
+
+    @property
     def accounted(self) -> float:
-        """By how much chi squared falls with the one that explains most of those of which `covariance` holds the effect."""
-        each = [one.fall for one in (*self.ratios, self.scaling, self.sliding, self.surface) if one is not None]
+        """By how much chi squared falls with the one that explains most of those of which `covariance` holds the effect.
+
+        That of one which changes a logarithm by `MOST_OF_RATIO` or more is not known to first order.
+        """
+        those = (*self.ratios, self.scaling, self.sliding, self.surface, self.eigenstrain)
+        each = [one.fall for one in those if one is not None and np.abs(one.theta).max() < MOST_OF_RATIO]
         return max([*each, *(one.gain for one in self.readings if one.likelier)], default=0.0)
 
     @classmethod
@@ -129,25 +140,33 @@ class OtherCauses:
         averages = averaging(test, fit.residuals, stretch, fit.bounds)
         sliding, surface = (None, None) if of_map else (asked_sliding(test, variance, stretch), asked_surface(test, variance, stretch))
         of_geometry = max((one.fall for one in (sliding, surface) if one is not None), default=0.0)
+        eigenstrain = None if of_map else asked_eigenstrain(test, variance, stretch)
+        if eigenstrain is not None and eigenstrain.fall <= max(of_law, of_geometry):
+            eigenstrain = None  # what explains more looks like it
+        of_geometry = max(of_geometry, 0.0 if eigenstrain is None else eigenstrain.fall)
         scaling = unless_explained(asked_scaling(test, variance, stretch), judged, of_law, of_geometry)
         readings = other_readings(test.at.model, fit.point, max(of_law, of_geometry), fit.by_elements, variance, fit.bounds)
         of_law = max(of_law, *[one.fall for one in ratios]) if ratios else of_law
         explained = max(of_law, EXPLAINS * fit.beyond_noise)
         averages = None if of_geometry > explained else averages  # neighbours share what a jump or a wrong surface leaves as well
-        return cls(of_law, fit.beyond_noise, ratios, readings, averages, scaling, sliding, surface)
+        return cls(of_law, fit.beyond_noise, ratios, readings, averages, scaling, sliding, surface, eigenstrain)
 
     def judged(self, judged: Verdict, zones: Zones, theta: FloatArray, total: Uncertainty, *, coarse: bool) -> Verdict:
         """Return the verdict with them, the one that explains most first; see `judged_scaling` for `coarse` elements."""
         judged = judged_readings(judged, self.readings, zones, theta)
         judged = judged_averages(judged_ratios(judged, self.ratios, zones, theta), self.averages, zones, theta)
         judged = judged_scaling(judged, self.scaling, zones, theta, total, self.explained, coarse=coarse)
-        if self.sliding is None or self.surface is None or self.sliding.fall < self.surface.fall:  # the last comes first
-            judged = judged_sliding(judged, self.sliding, zones, theta, self.explained)
-            return judged_surface(judged, self.surface, zones, theta, self.of_law, self.beyond_noise)
-        judged = judged_surface(judged, self.surface, zones, theta, self.of_law, self.beyond_noise)
-        return judged_sliding(judged, self.sliding, zones, theta, self.explained)
+        there = [one for one in (self.sliding, self.surface, self.eigenstrain) if one is not None]
+        for one in sorted(there, key=lambda each: each.fall):  # the last one that comes first is the first of all
+            if isinstance(one, Sliding):
+                judged = judged_sliding(judged, one, zones, theta, self.explained)
+            elif isinstance(one, SurfacePlace):
+                judged = judged_surface(judged, one, zones, theta, self.of_law, self.beyond_noise)
+            else:
+                judged = judged_eigenstrain(judged, one, zones, theta, self.explained)
+        return judged
 
     def covariance(self, size: int) -> FloatArray:
         """Return what they leave in doubt of logarithms (size, size), known ratios aside: by as much as they change them."""
-        of_each = [np.outer(one.theta, one.theta) for one in (self.averages, self.scaling, self.sliding, self.surface) if one is not None]
+        of_each = [np.outer(one.theta, one.theta) for one in self._each if one is not None]
         return covariance_of_readings(self.readings, size) + np.asarray(sum(of_each, np.zeros((size, size))))

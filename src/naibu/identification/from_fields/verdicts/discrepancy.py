@@ -30,8 +30,8 @@ def doubt_of_model(judged: Verdict, information: FloatArray, beyond_noise: float
         By how much chi squared exceeds what noise leaves on average. The part of it that is as little of the deformation as needs no
         explanation does not count: errors of elements leave as much, and have a doubt of their own.
     accounted : float
-        How much of that a cause explains whose effect on the moduli is part of their covariance. What is not explained at all is so far from
-        any such cause that its effect, to first order, says little: nothing is accounted for then.
+        How much of that a cause explains whose effect on the moduli is part of their covariance. What is not explained at all is so far
+        from any such cause that its effect, to first order, says little: nothing is accounted for then.
     """
     covariance = Uncertainty.of(information).covariance
     needs = 1.0 - (SMALL / max(judged.unexplained, SMALL)) ** 2
