@@ -138,14 +138,15 @@ class OtherCauses:
         """
         test, variance, stretch = fit.test, fit.variance, fit.stretch
         averages = averaging(test, fit.residuals, stretch, fit.bounds)
-        sliding, surface = (None, None) if of_map else (asked_sliding(test, variance, stretch), asked_surface(test, variance, stretch))
+        sliding = None if of_map else asked_sliding(test, variance, stretch)
+        surface = None if of_map or fit.beyond_noise <= 0.0 else asked_surface(test, variance, stretch)  # averages leave less than noise
         of_geometry = max((one.fall for one in (sliding, surface) if one is not None), default=0.0)
         eigenstrain = None if of_map else asked_eigenstrain(test, variance, stretch)
         if eigenstrain is not None and eigenstrain.fall <= max(of_law, of_geometry):
             eigenstrain = None  # what explains more looks like it
-        of_geometry = max(of_geometry, 0.0 if eigenstrain is None else eigenstrain.fall)
-        scaling = unless_explained(asked_scaling(test, variance, stretch), judged, of_law, of_geometry)
-        readings = other_readings(test.at.model, fit.point, max(of_law, of_geometry), fit.by_elements, variance, fit.bounds)
+        of_any = max(of_geometry, 0.0 if eigenstrain is None else eigenstrain.fall)
+        scaling = unless_explained(asked_scaling(test, variance, stretch), judged, of_law, of_any)
+        readings = other_readings(test.at.model, fit.point, max(of_law, of_any), fit.by_elements, variance, fit.bounds)
         of_law = max(of_law, *[one.fall for one in ratios]) if ratios else of_law
         explained = max(of_law, EXPLAINS * fit.beyond_noise)
         averages = None if of_geometry > explained else averages  # neighbours share what a jump or a wrong surface leaves as well
