@@ -41,7 +41,7 @@ def design(
     zones
         Volume of labels of the object, one for each material, 0 outside; or give a box by --size-mm.
     zone_name
-        Name of a label, 'gel=1'. May be repeated.
+        Name of a label, 'gel=1' or '1=gel'. May be repeated.
     size_mm
         Sides of a box along x, y and z.
     layer

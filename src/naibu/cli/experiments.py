@@ -111,7 +111,7 @@ def identify(
     zones
         With fields: volume of labels, one for each material, 0 outside.
     zone_name
-        With fields: name of a label, 'gel=1'. May be repeated.
+        With fields: name of a label, 'gel=1' or '1=gel'. May be repeated.
     loaded
         With fields: a side where forces act, x-, x+, y-, y+, z- or z+, if they act at no other. May be repeated.
     cell_map

@@ -21,6 +21,7 @@ from naibu.identification.from_fields.assumptions.other_readings import (
     REVERSED,
     Reading,
     judged_readings,
+    likelier,
 )
 from naibu.identification.from_fields.estimate import identify_field
 from naibu.identification.from_fields.field_estimate import FieldEstimate
@@ -132,6 +133,8 @@ def test_what_fits_as_well_is_a_note_and_what_fits_worse_nothing() -> None:
     assert judged.explanation is Explanation.EXPLAINED and not judged.reasons
     assert judged.notes == ("The fields would fit as well with this: that they are not is taken for given.",)
     assert judged_readings(EXPLAINED, [Reading("that", none, -3.0 * DECISIVE)], zones, theta) == EXPLAINED
+    by_elements = Reading("this", softer, 4.0 * DECISIVE, beyond_elements=False)  # as what smaller elements explain to within noise
+    assert judged_readings(EXPLAINED, [by_elements], zones, theta).reasons == () and likelier([by_elements]) == ()
     against = judged_readings(EXPLAINED, [Reading("this", softer, 4.0 * DECISIVE), Reading("that", none, 2.0 * DECISIVE)], zones, theta)
     assert against.explanation is Explanation.IN_PART
     assert "with this (chi squared falls by 100), which would" in against.reasons[0] and "50 % lower" in against.reasons[0]

@@ -272,11 +272,13 @@ def test_known_values_and_what_is_wrong_with_them() -> None:
     read = parse_known_zones(["gel=12 kPa", "bone=rigid"], names)
     assert read.values["gel"] == (12.0, 0.45) and read.doubts["gel"][1] > 0.0 and read.values["bone"][0] > 1000.0 and not read.relative
     assert parse_known_zones(["pad"], names).relative
+    assert parse_known_zones(["pad=10 kPa, 0.5"], names).values == parse_known_zones(["pad=10 kPa, 0.4999"], names).values
     for known, message in (
         (["skin=3 kPa"], "no zone 'skin'"),
         (["bone=rigid"], "nothing sets the scale"),
         ([], "nothing sets the scale"),
         (["gel=soft"], "write 'gel=12 kPa'"),
+        (["gel=12 kPa, 0.6"], "between 0 and 0.5, not 0.6"),
         (["gel=12 kPa", "pad"], "state all, or name one"),
         (["gel=12 kPa", "gel=10 kPa"], "zone 'gel' is stated twice"),
         (["gel=12 kPa", "gel=rigid"], "zone 'gel' is stated twice"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,17 @@ from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
+from naibu.io import write_volume
 from naibu.workflows.fields.block_mesh import block_mesh
-from naibu.workflows.fields.measured_load_case import beyond_object, beyond_rim, doubts_of_field, measured_load_case, placed_on_scan
+from naibu.workflows.fields.identify_fields import identify_fields
+from naibu.workflows.fields.measured_load_case import (
+    beyond_object,
+    beyond_rim,
+    doubts_of_field,
+    measured_load_case,
+    placed_on_scan,
+    without_copies,
+)
 
 SIDE_MM = 40.0
 INSIDE = Volume.from_array(np.ones((20, 20, 20), np.uint8), spacing_mm=(2.0,) * 3, origin_mm=(1.0,) * 3)
@@ -90,11 +101,30 @@ def test_a_mask_that_shows_a_part_of_what_was_measured_is_told(kept: float, told
 
 
 def test_copies_of_a_measurement_count_once() -> None:
-    once = case(POINTS).field
-    twice = case(np.concatenate([POINTS, POINTS[:100]])).field
-    contradicting = case(np.concatenate([POINTS, POINTS[:100]]), np.concatenate([0.05 * POINTS, 0.06 * POINTS[:100]])).field
-    assert len(once.points) == len(twice.points) == 300
-    assert len(contradicting.points) == 400
+    points, again = np.concatenate([POINTS, POINTS[:100]]), 0.05 * np.concatenate([POINTS, POINTS[:100]])
+    otherwise = np.concatenate([0.05 * POINTS, 0.06 * POINTS[:100]])
+    given = ((POINTS, 0.05 * POINTS), (points, again), (points, otherwise))
+    once, twice, contradicting = (without_copies(DisplacementField.from_arrays(p, u, sd_mm=0.1)) for p, u in given)
+    assert once.covariance is not None and twice.covariance is not None
+    assert np.array_equal(once.points, twice.points) and np.array_equal(once.vectors, twice.vectors)
+    assert np.array_equal(once.covariance, twice.covariance) and len(contradicting.points) == 400
+
+
+def test_copies_of_measurements_do_not_make_cells_smaller(tmp_path: Path) -> None:
+    """A file with every particle ten times gets the cells, and the moduli, of one with every particle once."""
+    labels = np.repeat([1, 2], 8000).reshape(40, 20, 20).astype(np.uint8)
+    write_volume(tmp_path / "labels.mha", Volume.from_array(labels, spacing_mm=(1.0,) * 3))
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.4, 19.4, (300, 3)) * [1.0, 1.0, 2.0]
+    vectors = 0.02 * points * [0.4, 0.4, -1.0] + 0.01 * rng.standard_normal(points.shape)
+    cells = []
+    for name, times in (("once", 1), ("often", 10)):
+        table = np.tile(np.column_stack([points, vectors, np.full_like(points, 0.01)]), (times, 1))
+        columns = "x_mm,y_mm,z_mm,ux_mm,uy_mm,uz_mm,sd_x_mm,sd_y_mm,sd_z_mm"
+        np.savetxt(tmp_path / f"{name}.csv", table, delimiter=",", header=columns, comments="")
+        scanned = identify_fields(tmp_path / f"{name}.csv", zones=tmp_path / "labels.mha", known=["label 1=5 kPa, 0.4"], law="linear")
+        cells.append((scanned.estimate.mesh.n_cells, *scanned.estimate.theta))
+    assert cells[0] == cells[1]
 
 
 @pytest.mark.parametrize(("strain", "told"), [(0.05, False), (2e-3, False), (5e-5, True)])

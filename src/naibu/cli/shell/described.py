@@ -195,7 +195,7 @@ def layers_of(texts: Sequence[str]) -> tuple[Layer, ...]:
 
 
 def labels_of(texts: Sequence[str]) -> dict[int, str]:
-    """Return names by label from texts such as ``gel=1``.
+    """Return names by label from texts such as ``gel=1``, or ``1=gel``; where both sides are numbers, the second is the label.
 
     Raises
     ------
@@ -205,8 +205,10 @@ def labels_of(texts: Sequence[str]) -> dict[int, str]:
     names: dict[int, str] = {}
     for text in texts:
         name, _, label = text.rpartition("=")
+        if name.strip().isdecimal() and not label.strip().isdecimal():  # no name but of digits has such a label
+            name, label = label, name
         if not name.strip() or not label.strip().isdecimal() or len(label) > 9:
-            raise InputError(f"zone_name {text!r} must give a name and a label, such as 'gel=1'")
+            raise InputError(f"zone_name {text!r} must give a name and a label, which is a whole number, such as 'gel=1'")
         if int(label) in names or name.strip() in names.values():
             raise InputError(f"zone_name {text!r} names a label, or has a name, that another zone_name has; give each label one name")
         names[int(label)] = name.strip()

@@ -10,18 +10,10 @@ import numpy as np
 from naibu.core.arrays import FloatArray
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumed_law
-from naibu.identification.from_fields.assumptions.averaged_displacements import averaging, judged_averages
-from naibu.identification.from_fields.assumptions.known_ratios import asked_ratios, doubt_of_ratios, judged_ratios
+from naibu.identification.from_fields.assumptions.known_ratios import asked_ratios, doubt_of_ratios
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
-from naibu.identification.from_fields.assumptions.other_readings import covariance_of_readings, judged_readings, other_readings
-from naibu.identification.from_fields.assumptions.scaled_displacements import (
-    EXPLAINS,
-    asked_scaling,
-    judged_scaling,
-    unless_explained,
-)
+from naibu.identification.from_fields.assumptions.other_causes import Fitted, OtherCauses
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
-from naibu.identification.from_fields.assumptions.sliding_borders import asked_sliding, judged_sliding
 from naibu.identification.from_fields.field_estimate import FieldEstimate
 from naibu.identification.from_fields.forward.field_laws import FieldElements, LawName
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point
@@ -43,6 +35,7 @@ from naibu.identification.from_fields.surface.bias import LEFT, without_bias
 from naibu.identification.from_fields.surface.noise import SurfaceNoise
 from naibu.identification.from_fields.surface.skewness import distances_of_bounds
 from naibu.identification.from_fields.uncertainty import ErrorBudget, Uncertainty, intervals
+from naibu.identification.from_fields.verdicts.discrepancy import doubt_of_model
 from naibu.identification.from_fields.verdicts.statement import statement
 from naibu.identification.from_fields.verdicts.verdict import FEW_POINTS, inflation, tells_poisson, verdict, with_enough_points
 from naibu.identification.from_fields.verdicts.within_cells import DETERMINED, HalfSize, judged_within_cells, with_limits
@@ -98,9 +91,9 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     free, law = assumed_law.with_law_free(found.at, finer, fit.freedom, found.stretch)
     variance = found.shared * max(1.0, found.misfit / fit.freedom)
     test = ScoreTest.of(found.at, found.quadratic, finer)
-    ratios, scaling = asked_ratios(test, variance, found.stretch), asked_scaling(test, variance, found.stretch)
+    ratios = asked_ratios(test, variance, found.stretch)
     judged, thin = _judged(fit, found, settings)
-    averages = averaging(test, found.size.residuals, found.stretch, settings.bounds)
+    explained = judged
     of_elements, coarse = _of_elements(fit, found, settings, judged, thin)
     total = found.of_noise.with_added(of_known + doubt_of_ratios(ratios, len(of_known))).with_law(law)
     total = total if of_elements is None else total.with_added(of_elements)
@@ -112,19 +105,12 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     by_elements = None if of_elements is None else replace(found.of_noise, covariance=of_elements).of_young_and_poisson(theta)[0]
     known = found.size.shift is not None and found.size.alike
     judged, of_law = assumed_law.judged(judged, free, model.zones, theta, total, elements_known=known)
-    of_free = 0.0 if free is None else free.fall
-    sliding = asked_sliding(test, variance, found.stretch) if fit.refined is None else None
-    of_sliding = 0.0 if sliding is None else sliding.fall
-    scaling = unless_explained(scaling, judged, of_free, of_sliding)
-    readings = other_readings(model, fit.point, max(of_free, of_sliding), variance, settings.bounds)
-    judged = judged_readings(judged, readings, model.zones, theta)
-    explained = max(of_free, *[one.fall for one in ratios], EXPLAINS * (found.misfit - fit.freedom))
-    averages = None if of_sliding > explained else averages  # neighbours share what a jump leaves as well
-    judged = judged_averages(judged_ratios(judged, ratios, model.zones, theta), averages, model.zones, theta)
-    judged = judged_scaling(judged, scaling, model.zones, theta, total, explained, coarse=coarse)
-    judged = judged_sliding(judged, sliding, model.zones, theta, explained)
-    doubts = sum(np.outer(one.theta, one.theta) for one in (averages, scaling, sliding) if one is not None)
-    total = total.with_added(covariance_of_readings(readings, len(theta)) + doubts)
+    whole = Fitted(test, fit.point, variance, found.stretch, found.size.residuals, found.misfit - fit.freedom, settings.bounds)
+    causes = OtherCauses.asked(whole, judged, 0.0 if free is None else free.fall, ratios, of_map=fit.refined is not None)
+    judged = causes.judged(judged, model.zones, theta, total, coarse=coarse)
+    accounted = max(causes.accounted, 0.0 if law is None or free is None else free.fall)
+    of_model = doubt_of_model(explained, found.information, found.misfit - fit.freedom, accounted)
+    total = total.with_added(causes.covariance(len(theta)) + of_model * np.outer(found.stretch, found.stretch))
     judged = with_limits(judged, model.zones.names, by_elements, intervals(theta, total)[0], model.zones.unit, of_law=of_law)
     of_mesh = np.full(len(theta), np.nan) if of_elements is None else np.sqrt(np.diag(of_elements))
     budget = ErrorBudget(found.of_noise.standard_deviations(), of_mesh, np.sqrt(np.diag(of_known)), found.shared)
@@ -161,6 +147,8 @@ class _Measured:
         On the mesh, and at vanishing element size.
     bias, taken : ndarray, shape (2 count,)
         What of the bias is left, and all of it that is taken off the best fit.
+    information : ndarray, shape (2 count, 2 count)
+        Fisher information of the moduli for the stated noise.
     """
 
     point: Point
@@ -174,6 +162,7 @@ class _Measured:
     of_noise: Uncertainty
     bias: FloatArray
     taken: FloatArray
+    information: FloatArray
 
     @classmethod
     def of(cls, fit: RegionFit, settings: EstimateSettings) -> _Measured:
@@ -196,7 +185,8 @@ class _Measured:
         stretch = stretch_of(np.zeros_like(size.theta) if size.shift is None or fit.corrected is not None else size.shift)
         bias = score.left(noise.information)
         taken = fit.point.theta - point.theta + bias
-        return cls(point, at, quadratic, size, stretch, misfit, shared, of_noise, of_noise.stretched(stretch), bias, taken)
+        stretched, information = of_noise.stretched(stretch), noise.information.matrix
+        return cls(point, at, quadratic, size, stretch, misfit, shared, of_noise, stretched, bias, taken, information)
 
 
 def _size(fit: RegionFit, settings: EstimateSettings, at: Linearised, quadratic: Concentrated, noise: SurfaceNoise) -> SizeCorrection:

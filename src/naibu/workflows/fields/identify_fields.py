@@ -43,7 +43,14 @@ from naibu.workflows.fields.cells_of_map import cubes_of_map
 from naibu.workflows.fields.cells_of_zones import POINTS_OF_CELL, cubes_of_zones
 from naibu.workflows.fields.known_zones import NOTHING_KNOWN, KnownZones, parse_known_zones
 from naibu.workflows.fields.likely_components import require_likely_components
-from naibu.workflows.fields.measured_load_case import beyond_object, beyond_rim, doubts_of_field, placed_on_scan, relative_deformation
+from naibu.workflows.fields.measured_load_case import (
+    beyond_object,
+    beyond_rim,
+    doubts_of_field,
+    placed_on_scan,
+    relative_deformation,
+    without_copies,
+)
 from naibu.workflows.fields.object_on_cubes import MOST_REFINED, ObjectOnCubes, ScannedObject, identified_on_smaller_cubes
 from naibu.workflows.fields.thin_coverings import Covering, told_left_out
 from naibu.workflows.results.files_together import written_together
@@ -196,7 +203,7 @@ def identify_fields(
     read = [read_field(path, unit=unit, spacing_mm=spacing_mm, node_spacing=node_spacing) for path in paths]
     _require_different(paths, read)
     inside, labels = labelled_object(mask, zones)
-    read = [placed_on_scan(field, spacing_mm, inside) for field in read]
+    read = [without_copies(placed_on_scan(field, spacing_mm, inside)) for field in read]
     names = names_of_labels(labels, inside, zone_names or {})
     given = stated = _stated(known, list(names.values()), each_cell=each_cell)
     scanned = ScannedObject(inside, labels, names, tuple((Path(p).stem, f) for p, f in zip(paths, read, strict=True)), tuple(loaded))

@@ -15,7 +15,7 @@ RIGID = (
     3e4  # stiffness of what is called rigid over that of the stiffest other known material: with 300 a slender bone bends by a millimetre
 )
 BEYOND_KNOWN = 1e4  # times the stiffest, or part of the softest, known Young's modulus
-LARGEST_POISSON_RATIO = 0.499  # of a known zone: beyond, elements of one pressure each lock
+LARGEST_POISSON_RATIO = 0.4999  # that is computed with: beyond, displacements change by less than a part in a thousand of the strain
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -94,6 +94,8 @@ def parse_known_zones(known: Sequence[str], names: Sequence[str]) -> KnownZones:
 def stated_moduli(argument: str, text: str, value: str) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return Young's modulus, kPa, and Poisson's ratio, and their standard deviations, of ``12 kPa`` or ``12 kPa, 0.45``.
 
+    Ratios above `LARGEST_POISSON_RATIO`, up to 0.5, are computed with as that.
+
     Raises
     ------
     InputError
@@ -107,6 +109,6 @@ def stated_moduli(argument: str, text: str, value: str) -> tuple[tuple[float, fl
         other = ", 'bone=rigid', or 'gel'" if argument == "known" else ""
         ways = f"write 'gel=12 kPa', 'gel=12 kPa, 0.45' with Poisson's ratio{other}"
         raise InputError(f"{argument}={text!r}: {ways}{said}") from error
-    if not 0.0 <= poisson <= LARGEST_POISSON_RATIO:
-        raise InputError(f"{argument}={text!r}: Poisson's ratio must lie between 0 and {LARGEST_POISSON_RATIO:g}, not {poisson:g}")
-    return (young, poisson), (0.0, 0.0 if comma else POISSON_RATIO_SD)
+    if not 0.0 <= poisson <= 0.5:
+        raise InputError(f"{argument}={text!r}: Poisson's ratio must lie between 0 and 0.5, not {poisson:g}")
+    return (young, min(poisson, LARGEST_POISSON_RATIO)), (0.0, 0.0 if comma else POISSON_RATIO_SD)

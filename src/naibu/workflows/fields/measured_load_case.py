@@ -71,14 +71,25 @@ def measured_load_case(
             f"{_likely_frame(at.points[at.valid], inside)}"
         )
     _require_space(name, mesh, at.points[chosen])
-    # copies of a measurement, such as those of nodes that cells of a mesh do not share, count once
-    chosen = chosen[np.sort(np.unique(np.column_stack([at.points[chosen], at.vectors[chosen]]), axis=0, return_index=True)[1])]
     every = -(-len(chosen) // MOST_POINTS)
     chosen = np.random.default_rng(0).permutation(chosen)[: len(chosen) // every]
     covariance = None if at.covariance is None else at.covariance[chosen]
     some = DisplacementField.from_arrays(at.points[chosen], at.vectors[chosen], covariance=covariance)
     _require_deformation(name, some)
     return FieldLoadCase.of(name, some, mesh, loaded=loaded_nodes(mesh, inside.direction, sides))
+
+
+def without_copies(field: DisplacementField) -> DisplacementField:
+    """Return a field in which copies of a measurement, such as those of nodes that cells of a mesh do not share, are there once."""
+    if isinstance(field.support, Volume):
+        return field
+    at = field.at_points()
+    there = np.flatnonzero(at.valid)
+    kept = there[np.sort(np.unique(np.column_stack([at.points[there], at.vectors[there]]), axis=0, return_index=True)[1])]
+    if len(kept) == len(there):
+        return field
+    covariance = None if at.covariance is None else at.covariance[kept]
+    return DisplacementField.from_arrays(at.points[kept], at.vectors[kept], covariance=covariance)
 
 
 def placed_on_scan(field: DisplacementField, spacing_mm: Sequence[float] | None, scan: Volume) -> DisplacementField:

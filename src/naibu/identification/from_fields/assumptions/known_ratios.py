@@ -82,7 +82,8 @@ def asked_ratios(test: ScoreTest, variance: float, stretch: FloatArray) -> tuple
         if found is None:
             continue
         stated, other = (_compressibility(nu) for nu in (region.poisson_ratio, near))
-        part = (max(stated + found.part * (other - stated), _compressibility(MAX_POISSON_RATIO)) - stated) / (other - stated)
+        least = min(_compressibility(MAX_POISSON_RATIO), stated)
+        part = (max(stated + found.part * (other - stated), least) - stated) / (other - stated)
         asked = _poisson_ratio(stated + part * (other - stated))
         theta = np.clip(part * stretch * found.theta, -most, most)
         fall = found.part**2 * found.size

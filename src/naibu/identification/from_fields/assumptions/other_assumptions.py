@@ -92,7 +92,7 @@ def assumptions(
             if changed is not None:
                 out.append(Assumption(text, changed, sd))
     for border in borders if model.computed is model.mesh else ():
-        changed = _with_border(at, quadratic, law, border.points)
+        changed = _with_border(at, quadratic, border.points)
         if changed is not None:
             out.append(Assumption(border.text, changed, border.standard_deviations))
     if model.mesh.dimension == 3:
@@ -165,7 +165,7 @@ def _others(region: KnownRegion) -> list[tuple[str, float, float, float]]:
     of_young = OTHER_YOUNG / region.young_modulus_sd if region.young_modulus_sd > 0.0 else 0.0
     of_poisson = abs(near - poisson) / region.poisson_ratio_sd if region.poisson_ratio_sd > 0.0 else 0.0
     stiffer = (1.0 + OTHER_YOUNG) * young
-    other_ratio = (f"with Poisson's ratio {near:.3g} for {poisson:.3g} of {region.name!r}", young, near, of_poisson)
+    other_ratio = (f"with Poisson's ratio {near:.4g} for {poisson:.4g} of {region.name!r}", young, near, of_poisson)
     if region.is_unit:
         return [other_ratio]
     return [(f"with {stiffer:.4g} kPa for {young:.4g} kPa of {region.name!r}", stiffer, poisson, of_young), other_ratio]
@@ -194,18 +194,29 @@ def changes_under(at: Linearised, law: FieldLaw, lame: FloatArray, shear: FloatA
     return changes
 
 
-def _with_border(at: Linearised, quadratic: Concentrated, law: LawName, points: FloatArray) -> FloatArray | None:
-    """Return the change (2 count,) of theta when the nodes of the mesh lie elsewhere; None where there is no equilibrium."""
+def changes_on(at: Linearised, points: FloatArray) -> list[FloatArray]:
+    """Return by how much whitened residuals (q,) change when the nodes of the mesh lie elsewhere (n, 3), mm, the loaded ones moving alike.
+
+    Raises
+    ------
+    ConvergenceError
+        There is no equilibrium.
+    """
     model = at.model
     mesh = replace(model.mesh, points=points)
-    body = field_law(mesh, law, averaged=model.averaged)
+    body = field_law(mesh, "linear" if model.law.linear else "neo_hookean", averaged=model.averaged)
     lame, shear = moduli_of(model.zones, at.point.theta)
     solvers, changes = Solvers(body, points), []
+    for o, u in zip(model.observed, at.point.states, strict=True):
+        on = Observed.of(mesh, mesh, o.load_case)
+        state, _ = equilibrium(body, solvers, lame, shear, on.load_case, u, b"")
+        changes.append(on.residual(state) - o.residual(u))
+    return changes
+
+
+def _with_border(at: Linearised, quadratic: Concentrated, points: FloatArray) -> FloatArray | None:
+    """Return the change (2 count,) of theta when the nodes of the mesh lie elsewhere; None where there is no equilibrium."""
     try:
-        for o, u in zip(model.observed, at.point.states, strict=True):
-            on = Observed.of(mesh, mesh, o.load_case)
-            state, _ = equilibrium(body, solvers, lame, shear, on.load_case, u, b"")
-            changes.append(on.residual(state) - o.residual(u))
-        return change_of_fit(at, quadratic, changes)
+        return change_of_fit(at, quadratic, changes_on(at, points))
     except ConvergenceError:
         return None

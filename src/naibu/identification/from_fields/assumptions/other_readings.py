@@ -57,20 +57,25 @@ class Reading:
         field that was computed at small strain lies half-way to the reversed one.
     part : float
         Of what these leave beyond noise, that it explains.
+    beyond_elements : bool
+        Whether it explains more of what is left on the mesh than elements of half the size do.
     """
 
     text: str
     theta: FloatArray
     gain: float
     part: float = 1.0
+    beyond_elements: bool = True
 
     @property
     def likelier(self) -> bool:
         """Whether the reading fits far better than the fields as they are."""
-        return self.gain > DECISIVE and self.part >= LEAST_PART
+        return self.gain > DECISIVE and self.part >= LEAST_PART and self.beyond_elements
 
 
-def other_readings(model: FieldModel, best: Point, of_law: float, variance: float, bounds: Bounds) -> tuple[Reading, ...]:
+def other_readings(
+    model: FieldModel, best: Point, of_law: float, of_elements: float, variance: float, bounds: Bounds
+) -> tuple[Reading, ...]:
     """Return the readings of fields of a body in space; none where small strain was assumed, or is so small that it changes nothing.
 
     Parameters
@@ -79,7 +84,10 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
     best : Point
         The best fit of the fields as they are.
     of_law : float
-        By how much chi squared falls with the shape of the law free, or with a border that slides.
+        By how much chi squared falls with the shape of the law free, a border that slides, or another place of the free surface.
+    of_elements : float
+        By how much it falls with elements of half the size, if these leave no more than noise: with coarse ones about a small loaded
+        hole a true field looked exchanged.
     variance : float
         Of whitened residuals over that stated, errors that neighbours share counted.
     bounds : Bounds
@@ -102,7 +110,8 @@ def other_readings(model: FieldModel, best: Point, of_law: float, variance: floa
             continue
         left = other_law + sum(float(excess[kept].sum()) for excess, (_, kept) in zip(before, moved, strict=True))
         fall = left - sum(float(excess.sum()) for excess in _excess_of_points(other, found))
-        out.append(Reading(text, found.theta - best.theta, fall / variance, fall / max(left, abs(fall), 1e-300)))
+        more = fall - other_law > of_elements
+        out.append(Reading(text, found.theta - best.theta, fall / variance, fall / max(left, abs(fall), 1e-300), more))
     return tuple(out)
 
 

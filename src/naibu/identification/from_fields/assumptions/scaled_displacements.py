@@ -84,12 +84,12 @@ def asked_scaling(test: ScoreTest, variance: float, stretch: FloatArray) -> Scal
     return best if len(AXES) * float(chdtrc(1, largest)) < UNLIKELY else None  # of the largest of so many by chance, at most
 
 
-def unless_explained(found: Scaling | None, judged: Verdict, of_law: float, of_sliding: float) -> Scaling | None:
-    """Return the growth; None where chi squared falls as much with another law, which the verdict blames, or with a border that slides.
+def unless_explained(found: Scaling | None, judged: Verdict, of_law: float, of_geometry: float) -> Scaling | None:
+    """Return the growth; None where chi squared falls as much with another law, which the verdict blames, or with another geometry.
 
-    It falls by `of_law` and `of_sliding`.
+    It falls by `of_law`, and by `of_geometry` with a border that slides or another place of the free surface.
     """
-    if found is None or found.fall <= of_sliding:
+    if found is None or found.fall <= of_geometry:
         return None
     return None if found.fall <= of_law and any(reason.startswith(DOES_NOT_FIT) for reason in judged.reasons) else found
 

@@ -42,6 +42,7 @@ from naibu.mechanics.finite_elements.hyperelasticity import lame_parameters
 ONE_MATERIAL = (
     "One material explains the measurement: no difference of stiffness can be told from its noise, which does not mean that there is none."
 )
+REFERENCE = "one element in the middle, taken for known"
 
 
 def identify_relative_map(
@@ -96,7 +97,7 @@ def zones_beside(mesh: Mesh, cell: int) -> Zones:
     lame, shear = np.full(mesh.n_cells, np.nan), np.full(mesh.n_cells, np.nan)
     lame[cell], shear[cell] = lame_parameters(1.0, POISSON_RATIO)
     names = tuple(f"cell {c}" for c in range(mesh.n_cells) if c != cell)
-    reference = KnownRegion("reference cell", 1.0, POISSON_RATIO, poisson_ratio_sd=POISSON_RATIO_SD, is_unit=True)
+    reference = KnownRegion(REFERENCE, 1.0, POISSON_RATIO, poisson_ratio_sd=POISSON_RATIO_SD, is_unit=True)
     return Zones(there, names, lame, shear, (reference,), np.where(there == KNOWN, 0, KNOWN))
 
 
