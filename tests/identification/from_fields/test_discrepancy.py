@@ -22,7 +22,7 @@ NOISE_MM = 0.02
     ("border_mm", "sliding", "push", "worst"),
     [
         (25.0, False, (1.0, 0.0, -2.0), Explanation.IN_PART),  # labels are off by 5 mm: 3.3 to 4.9 was told of 5
-        (20.0, True, (1.2, 0.0, -0.8), Explanation.NOT_EXPLAINED),  # 5.5 to 12
+        (20.0, True, (1.2, 0.0, -0.8), Explanation.NOT_EXPLAINED),
     ],
 )
 def test_intervals_hold_moduli_where_borders_are_wrong_or_slide(
