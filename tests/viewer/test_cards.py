@@ -27,7 +27,7 @@ def test_a_parameter_shows_its_interval_or_why_there_is_none() -> None:
     shown = [(card.value, card.detail) for card in parameter_cards(rows)]
     assert shown == [
         ("20.1 kPa", "95 %: 18.9 to 21.4"),
-        ("0.490", "95 %: above 0.470"),
+        ("at least 0.47", "95 %"),
         ("0.300", "not bounded by the data"),
         ("200 kPa", "given"),
         ("0.6", "95 %: 0.0 to 1.1"),
