@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -118,6 +119,17 @@ def told_changes(zones: Zones, change: FloatArray, beyond: BoolArray | None = No
         for i in moved[:LISTED]
     ]
     return " and ".join(each)
+
+
+def told_shift(zones: Zones, theta: FloatArray, shift: FloatArray) -> str:
+    """Return in words what a shift of the logarithms theta (2 count,) changes of Young's moduli; empty where by little."""
+    return told_changes(zones, np.log(young_and_poisson(theta + shift)[0] / young_and_poisson(theta)[0]))
+
+
+def blamed(judged: Verdict, why: str, *, first: bool) -> Verdict:
+    """Return the verdict with another reason; where that comes first, another law is none."""
+    reasons = tuple(reason for reason in judged.reasons if not (first and reason.startswith(DOES_NOT_FIT)))
+    return replace(judged, reasons=reasons).in_part(why, first=first)
 
 
 def hangs_on_law(judged: Verdict, free: FreeLaw | None, total: Uncertainty, theta: FloatArray) -> str:

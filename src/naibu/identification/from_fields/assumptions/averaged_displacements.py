@@ -20,11 +20,11 @@ import scipy.sparse as sp
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.assumptions.assumed_law import told_changes
+from naibu.identification.from_fields.assumptions.assumed_law import told_shift
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
-from naibu.identification.from_fields.forward.sensitivities import Linearised, young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import Linearised
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, fitted_near
 from naibu.identification.from_fields.verdicts.verdict import WITHIN_NOISE
 from naibu.identification.neighbours import neighbours
@@ -124,7 +124,7 @@ def judged_averages(judged: Verdict, found: Averaging | None, zones: Zones, thet
     """Return the verdict with what averages would change, where that is much; last where residuals are more than noise."""
     if found is None:
         return judged
-    changes = told_changes(zones, np.log(young_and_poisson(theta + found.theta)[0] / young_and_poisson(theta)[0]))
+    changes = told_shift(zones, theta, found.theta)
     if not changes:
         return judged
     why = (

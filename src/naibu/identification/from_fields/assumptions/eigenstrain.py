@@ -7,17 +7,16 @@ together, is found to first order, moduli and the motion of the loaded nodes fol
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc
 
 from naibu.core.arrays import BoolArray, FloatArray
-from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, UNLIKELY, told_changes
+from naibu.identification.from_fields.assumptions.assumed_law import blamed, told_shift
 from naibu.identification.from_fields.assumptions.free_law import materials_of
-from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
+from naibu.identification.from_fields.assumptions.score_test import ScoreTest, most_asked
 from naibu.identification.from_fields.forward.load_cases import Zones
-from naibu.identification.from_fields.forward.sensitivities import Linearised, moduli_of, young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import Linearised, moduli_of
 from naibu.identification.verdict import Explanation, Verdict
 
 MOST_MATERIALS = 12  # that are tried: a solution of every load case each
@@ -65,18 +64,8 @@ def asked_eigenstrain(test: ScoreTest, variance: float, stretch: FloatArray) -> 
         return None
     if len(tried) > 1:
         tried[WHOLE] = np.ones(model.computed.n_cells, dtype=bool)
-    residuals = [np.ones(len(o.data), dtype=bool) for o in model.observed]
-    most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
-    best, largest = None, 0.0
-    for name, cells in tried.items():
-        found = test.along(_changes(test.at, cells), residuals)
-        if found is None:
-            continue
-        score = found.part**2 / (variance / found.size + found.of_elements**2)
-        if score > largest:
-            theta = np.clip(found.part * stretch * found.theta, -most, most)
-            largest, best = score, Eigenstrain(name, found.part, found.part**2 * found.size, theta)
-    return best if len(tried) * float(chdtrc(1, largest)) < UNLIKELY else None  # of the largest of so many by chance, at most
+    best = most_asked({name: test.of_residuals(_changes(test.at, cells)) for name, cells in tried.items()}, variance)
+    return None if best is None else Eigenstrain(best[0], best[1].part, best[1].fall, best[1].shift(stretch))
 
 
 def judged_eigenstrain(judged: Verdict, found: Eigenstrain | None, zones: Zones, theta: FloatArray, explained: float) -> Verdict:
@@ -86,7 +75,7 @@ def judged_eigenstrain(judged: Verdict, found: Eigenstrain | None, zones: Zones,
     """
     if found is None:
         return judged
-    changes = told_changes(zones, np.log(young_and_poisson(theta + found.theta)[0] / young_and_poisson(theta)[0]))
+    changes = told_shift(zones, theta, found.theta)
     first = found.fall > explained
     if not changes and (judged.explanation is Explanation.EXPLAINED or not first):
         return judged
@@ -95,8 +84,7 @@ def judged_eigenstrain(judged: Verdict, found: Eigenstrain | None, zones: Zones,
         f"{found.where} {BY_ITSELF}, by some {100.0 * found.volume:+.2g} %, as by uptake of water, drying, growth or temperature, or "
         f"lengths of the two scans differ in scale: measure with the same volume and scale{would}"
     )
-    reasons = tuple(reason for reason in judged.reasons if not (first and reason.startswith(DOES_NOT_FIT)))
-    return replace(judged, reasons=reasons).in_part(why, first=first)
+    return blamed(judged, why, first=first)
 
 
 def _changes(at: Linearised, cells: BoolArray) -> list[FloatArray]:

@@ -8,20 +8,19 @@ how far the field asks to go, and how much better it fits then, to first order, 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, UNLIKELY, told_changes
+from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, blamed, told_shift
 from naibu.identification.from_fields.assumptions.other_assumptions import changes_on
 from naibu.identification.from_fields.assumptions.scaled_displacements import EXPLAINS
-from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
+from naibu.identification.from_fields.assumptions.score_test import ScoreTest, most_asked
 from naibu.identification.from_fields.forward.load_cases import Zones
-from naibu.identification.from_fields.forward.sensitivities import FieldModel, young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import FieldModel
 from naibu.identification.from_fields.inversion.regularization import cell_volumes
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.surface import boundary_faces, face_normals
@@ -74,11 +73,8 @@ def asked_surface(test: ScoreTest, variance: float, stretch: FloatArray) -> Surf
         changes = changes_on(test.at, model.mesh.points + step * _outwards(model.mesh, free))
     except ConvergenceError:
         return None
-    found = test.along(changes, [np.ones(len(o.data), dtype=bool) for o in model.observed])
-    if found is None or float(chdtrc(1, found.part**2 / (variance / found.size + found.of_elements**2))) >= UNLIKELY:
-        return None
-    most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
-    return SurfacePlace(step * found.part, found.part**2 * found.size, np.clip(found.part * stretch * found.theta, -most, most))
+    best = most_asked({FREE_SURFACE: test.of_residuals(changes)}, variance)
+    return None if best is None else SurfacePlace(step * best[1].part, best[1].fall, best[1].shift(stretch))
 
 
 def judged_surface(
@@ -100,7 +96,7 @@ def judged_surface(
     """
     if found is None:
         return judged
-    changes = told_changes(zones, np.log(young_and_poisson(theta + found.theta)[0] / young_and_poisson(theta)[0]))
+    changes = told_shift(zones, theta, found.theta)
     over_law = next(iter(judged.reasons), "").startswith(DOES_NOT_FIT)
     first = found.fall > of_law and (over_law or found.fall > EXPLAINS * beyond_noise)
     if not changes and (judged.explanation is Explanation.EXPLAINED or not (first or found.fall > LEAST_PART * beyond_noise)):
@@ -111,8 +107,7 @@ def judged_surface(
         f"the fields ask for {FREE_SURFACE} some {abs(found.outwards_mm):.2g} mm {way} of where mask or zones have it, or for forces on "
         f"sides that are not named as loaded: check both{would}"
     )
-    reasons = tuple(reason for reason in judged.reasons if not (first and reason.startswith(DOES_NOT_FIT)))
-    return replace(judged, reasons=reasons).in_part(why, first=first)
+    return blamed(judged, why, first=first)
 
 
 def _free_faces(model: FieldModel) -> IntArray:

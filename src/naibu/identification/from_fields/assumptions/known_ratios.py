@@ -19,7 +19,7 @@ from naibu.core.errors import ConvergenceError
 from naibu.core.parameters import MAX_POISSON_RATIO
 from naibu.identification.from_fields.assumptions.assumed_law import MODULUS, UNLIKELY
 from naibu.identification.from_fields.assumptions.other_assumptions import changes_under, other_poisson_ratio
-from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
+from naibu.identification.from_fields.assumptions.score_test import ScoreTest
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import moduli_of, young_and_poisson
 from naibu.identification.verdict import Verdict
@@ -68,7 +68,6 @@ def asked_ratios(test: ScoreTest, variance: float, stretch: FloatArray) -> tuple
         By how much changes of logarithms are larger at vanishing element size.
     """
     at, model, out = test.at, test.at.model, []
-    most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
     for number, region in enumerate(model.zones.known):
         if region.is_rigid:
             continue
@@ -85,9 +84,8 @@ def asked_ratios(test: ScoreTest, variance: float, stretch: FloatArray) -> tuple
         least = min(_compressibility(MAX_POISSON_RATIO), stated)
         part = (max(stated + found.part * (other - stated), least) - stated) / (other - stated)
         asked = _poisson_ratio(stated + part * (other - stated))
-        theta = np.clip(part * stretch * found.theta, -most, most)
-        fall = found.part**2 * found.size
-        one = AskedRatio(region.name, region.poisson_ratio, asked, float(chdtrc(1, fall / variance)), fall, theta)
+        probability = float(chdtrc(1, found.fall / variance))
+        one = AskedRatio(region.name, region.poisson_ratio, asked, probability, found.fall, found.shift(stretch, part))
         matters = np.abs(_change(one, at.point.theta)).max(initial=0.0) > MODULUS
         if one.probability < UNLIKELY and matters and abs(asked - one.stated) > STATED_SD * region.poisson_ratio_sd:
             out.append(one)

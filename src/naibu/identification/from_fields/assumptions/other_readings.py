@@ -19,11 +19,11 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.core.progress import report_progress
-from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, LEAST_STRAIN, largest_strain, told_changes
+from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, LEAST_STRAIN, largest_strain, told_shift
 from naibu.identification.from_fields.assumptions.volume_change import mean_gradients
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
-from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point, young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Point
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, fitted_near
 from naibu.identification.verdict import Verdict
 from naibu.meshing.point_location import locate
@@ -137,7 +137,7 @@ def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, the
     if not better:
         return judged
     texts = " or ".join(f"{one.text} (chi squared falls by {one.gain:.3g})" for one in better)
-    changes = told_changes(zones, np.log(young_and_poisson(theta + better[0].theta)[0] / young_and_poisson(theta)[0]))
+    changes = told_shift(zones, theta, better[0].theta)
     why = CHECK.format(texts, f", which would make Young's modulus another one ({changes})" if changes else "")
     reasons = (reason for reason in judged.reasons if not reason.startswith(DOES_NOT_FIT))  # this explains more than another law
     return replace(judged, reasons=tuple(reasons)).in_part(why)

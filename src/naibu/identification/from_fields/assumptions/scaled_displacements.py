@@ -12,12 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import chdtrc
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, UNLIKELY, told_changes
-from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
+from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, told_changes
+from naibu.identification.from_fields.assumptions.score_test import ScoreTest, most_asked
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import young_and_poisson
@@ -70,18 +69,8 @@ def asked_scaling(test: ScoreTest, variance: float, stretch: FloatArray) -> Scal
     if model.mesh.dimension != 3 or not test.errors.any():
         return None
     each = [_grown(model.computed, o, u) for o, u in zip(model.observed, test.at.point.states, strict=True)]
-    most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
-    residuals = [np.ones(len(o.data), dtype=bool) for o in model.observed]
-    best, largest = None, 0.0
-    for axis in range(len(AXES)):
-        found = test.along([change[axis] for change in each], residuals)
-        if found is None:
-            continue
-        score = found.part**2 / (variance / found.size + found.of_elements**2)
-        if score > largest:
-            largest = score
-            best = Scaling(axis, found.part, found.part**2 * found.size, np.clip(found.part * stretch * found.theta, -most, most))
-    return best if len(AXES) * float(chdtrc(1, largest)) < UNLIKELY else None  # of the largest of so many by chance, at most
+    best = most_asked({axis: test.of_residuals([change[axis] for change in each]) for axis in range(len(AXES))}, variance)
+    return None if best is None else Scaling(best[0], best[1].part, best[1].fall, best[1].shift(stretch))
 
 
 def unless_explained(found: Scaling | None, judged: Verdict, of_law: float, of_geometry: float) -> Scaling | None:

@@ -7,15 +7,20 @@ they are is sought as well.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from scipy.special import chdtrc
 
 from naibu.core.arrays import BoolArray, FloatArray
+from naibu.identification.from_fields.assumptions.assumed_law import UNLIKELY
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised
 from naibu.identification.from_fields.inversion.told_combinations import told
 from naibu.identification.from_fields.mesh_error import Refit, refitted
+
+Direction = TypeVar("Direction")
 
 MOST_OF_RATIO = 1.0  # change of ln(kappa / mu) that counts: near incompressibility it may be any, to first order
 
@@ -41,6 +46,23 @@ class Asked:
     theta: FloatArray
     of_elements: float
 
+    @property
+    def fall(self) -> float:
+        """By how much chi squared falls with it."""
+        return self.part**2 * self.size
+
+    def score(self, variance: float) -> float:
+        """Return the score for whitened residuals of a variance, errors of elements counted: chi squared of one freedom by chance."""
+        return self.part**2 / (variance / self.size + self.of_elements**2)
+
+    def shift(self, stretch: FloatArray, part: float | None = None) -> FloatArray:
+        """Return by how much logarithms (2 count,) would change with `part`, all that is asked by default.
+
+        At vanishing element size they change by `stretch` (2 count,) as much; of the ratios `MOST_OF_RATIO` counts at most.
+        """
+        most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
+        return np.asarray(np.clip((self.part if part is None else part) * stretch * self.theta, -most, most))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScoreTest:
@@ -63,6 +85,10 @@ class ScoreTest:
             errors = _left(at, refitted(at, quadratic, [r - o.residual(u) for o, u, r in pairs])) - left
         return cls(at, quadratic, given.theta, left, errors)
 
+    def of_residuals(self, changes: list[FloatArray]) -> Asked | None:
+        """Return what the residuals alone say of changes (q,) of them, whatever the motion of the loaded nodes does."""
+        return self.along(changes, [np.ones(len(o.data), dtype=bool) for o in self.at.model.observed])
+
     def along(self, changes: list[FloatArray], counted: Sequence[BoolArray] | None = None) -> Asked | None:
         """Return what the field says of changes (q,) of the whitened residuals; None where moduli and motion make up for all of them.
 
@@ -80,6 +106,22 @@ class ScoreTest:
         of_elements = -_product(errors, whole) / _product(whole, whole)
         kept = told(self.quadratic.hessian)[1]
         return Asked(-_product(left, slope) / size, size, kept @ (kept.T @ (changed.theta - self.theta)), of_elements)
+
+
+def most_asked(found: Mapping[Direction, Asked | None], variance: float) -> tuple[Direction, Asked] | None:
+    """Return the direction that a field asks for most of those that were tried, None where chance or errors of elements give as much.
+
+    Parameters
+    ----------
+    found : mapping
+        What the field says of each of them; None counts as tried.
+    variance : float
+        Of whitened residuals, errors that neighbours share counted.
+    """
+    there = [(direction, one) for direction, one in found.items() if one is not None]
+    best = max(there, key=lambda each: each[1].score(variance), default=None)
+    # of the largest of so many by chance, at most
+    return best if best is not None and len(found) * float(chdtrc(1, best[1].score(variance))) < UNLIKELY else None
 
 
 def _left(at: Linearised, refit: Refit) -> FloatArray:

@@ -10,20 +10,19 @@ that is not more than that of a cell of the softer zone is none.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
-from scipy.special import chdtrc
 
 from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, UNLIKELY, told_changes
+from naibu.identification.from_fields.assumptions.assumed_law import blamed, told_shift
 from naibu.identification.from_fields.assumptions.free_law import materials_of
-from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
+from naibu.identification.from_fields.assumptions.score_test import Asked, ScoreTest, most_asked
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
-from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, moduli_of, young_and_poisson
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, moduli_of
 from naibu.identification.from_fields.inversion.regularization import cell_volumes
 from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.point_location import locate, operator_of
@@ -95,19 +94,16 @@ def asked_sliding(test: ScoreTest, variance: float, stretch: FloatArray) -> Slid
     if not 0 < len(borders) <= MOST_BORDERS:
         return None
     edge = float(cell_volumes(model.mesh).mean() ** (1.0 / 3.0))
-    residuals = [np.ones(len(o.data), dtype=bool) for o in model.observed]
-    most = np.repeat([np.inf, MOST_OF_RATIO], len(stretch) // 2)
-    best, largest = None, 0.0
-    for border in borders:
-        jumps, compliance = _jumps(test.at, border)
-        found = test.along(_changes(test.at, border, jumps), residuals) if compliance > 0.0 else None
-        if found is None or found.part * compliance * border.softer_kpa < edge:
-            continue
-        score = found.part**2 / (variance / found.size + found.of_elements**2)
-        if score > largest:
-            theta = np.clip(found.part * stretch * found.theta, -most, most)
-            largest, best = score, Sliding(border.names, found.part, found.part**2 * found.size, theta)
-    return best if len(borders) * float(chdtrc(1, largest)) < UNLIKELY else None  # of the largest of so many by chance, at most
+    found = {border: _asked(test, border, edge) for border in borders}
+    best = most_asked(found, variance)
+    return None if best is None else Sliding(best[0].names, best[1].part, best[1].fall, best[1].shift(stretch))
+
+
+def _asked(test: ScoreTest, border: Border, edge: float) -> Asked | None:
+    """Return what fields say of jumps along a border, None where one that lies elsewhere by an edge of a cell, mm, gives as much."""
+    jumps, compliance = _jumps(test.at, border)
+    found = test.of_residuals(_changes(test.at, border, jumps)) if compliance > 0.0 else None
+    return None if found is None or found.part * compliance * border.softer_kpa < edge else found
 
 
 def judged_sliding(judged: Verdict, found: Sliding | None, zones: Zones, theta: FloatArray, explained: float) -> Verdict:
@@ -117,7 +113,7 @@ def judged_sliding(judged: Verdict, found: Sliding | None, zones: Zones, theta: 
     """
     if found is None:
         return judged
-    changes = told_changes(zones, np.log(young_and_poisson(theta + found.theta)[0] / young_and_poisson(theta)[0]))
+    changes = told_shift(zones, theta, found.theta)
     first = found.fall > explained
     if not changes and (judged.explanation is Explanation.EXPLAINED or not first):
         return judged
@@ -127,8 +123,7 @@ def judged_sliding(judged: Verdict, found: Sliding | None, zones: Zones, theta: 
         f"displacements jump by some {found.jump_mm:.2g} mm across the border of {one} and {other}, as where {SLIDES}, "
         f"or a thin soft layer lies between them{would}"
     )
-    reasons = tuple(reason for reason in judged.reasons if not (first and reason.startswith(DOES_NOT_FIT)))
-    return replace(judged, reasons=reasons).in_part(why, first=first)
+    return blamed(judged, why, first=first)
 
 
 def _borders(model: FieldModel, theta: FloatArray) -> list[Border]:
