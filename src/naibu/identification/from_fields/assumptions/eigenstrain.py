@@ -2,24 +2,28 @@
 
 A volume that changes without stress is an eigenstrain (:cite:t:`mura1987`). The displacement that it makes of every material, and of all
 together, is found to first order, moduli and the motion of the loaded nodes following, and how much of it fits best
-(`naibu.identification.from_fields.assumptions.score_test`).
+(`naibu.identification.from_fields.assumptions.score_test`). Where nearly incompressible material is confined by what the field prescribes,
+hardly anything is seen of a growth, and any error asks for a large one: one of which the field shows less than half, held back by a pressure
+above the shear modulus, is none.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.identification.from_fields.assumptions.assumed_law import blamed, told_shift
 from naibu.identification.from_fields.assumptions.free_law import materials_of
-from naibu.identification.from_fields.assumptions.score_test import ScoreTest, most_asked
+from naibu.identification.from_fields.assumptions.score_test import Asked, ScoreTest, most_asked
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Linearised, moduli_of
 from naibu.identification.verdict import Explanation, Verdict
+from naibu.meshing.quality import signed_volumes
 
 MOST_MATERIALS = 12  # that are tried: a solution of every load case each
+MOST_HELD_BACK = 0.5  # part of a growth that the field may not show where the pressure against it is above the shear modulus
 WHOLE = "the whole body"
 BY_ITSELF = "changes its volume by itself"
 
@@ -64,7 +68,12 @@ def asked_eigenstrain(test: ScoreTest, variance: float, stretch: FloatArray) -> 
         return None
     if len(tried) > 1:
         tried[WHOLE] = np.ones(model.computed.n_cells, dtype=bool)
-    best = most_asked({name: test.of_residuals(_changes(test.at, cells)) for name, cells in tried.items()}, variance)
+    possible: dict[str, Asked | None] = {}
+    for name, cells in tried.items():
+        grown = _grown(test.at, cells)
+        asked = test.of_residuals([np.asarray(o.operator @ moved) for o, moved in zip(model.observed, grown, strict=True)])
+        possible[name] = None if asked is None or _held_back(test.at, cells, grown, asked.part) else asked
+    best = most_asked(possible, variance)
     return None if best is None else Eigenstrain(best[0], best[1].part, best[1].fall, best[1].shift(stretch))
 
 
@@ -87,8 +96,8 @@ def judged_eigenstrain(judged: Verdict, found: Eigenstrain | None, zones: Zones,
     return blamed(judged, why, first=first)
 
 
-def _changes(at: Linearised, cells: BoolArray) -> list[FloatArray]:
-    """Return what a growth of the volume of cells (m,) by the whole of it changes of the whitened displacement (q,) of every load case."""
+def _grown(at: Linearised, cells: BoolArray) -> list[FloatArray]:
+    """Return what a growth of the volume of cells (m,) by the whole of it changes of the displacement (3 n,) of every load case."""
     model = at.model
     lame, shear = (np.where(cells, moduli, 0.0) for moduli in moduli_of(model.zones, at.point.theta))
     grown = (model.points / 3.0).ravel()
@@ -97,4 +106,15 @@ def _changes(at: Linearised, cells: BoolArray) -> list[FloatArray]:
         force = np.asarray(model.law.stiffness(lame, shear, u) @ grown)
         force[o.loaded] = 0.0
         right.append(force[:, None])
-    return [np.asarray(o.operator @ moved[:, 0]) for o, moved in zip(model.observed, at.solved(right), strict=True)]
+    return [moved[:, 0] for moved in at.solved(right)]
+
+
+def _held_back(at: Linearised, cells: BoolArray, grown: list[FloatArray], part: float) -> bool:
+    """Return whether cells (m,) show so much less than they grow, `part`, that a pressure above their shear modulus holds it back."""
+    mesh = at.model.computed
+    volumes = signed_volumes(mesh)[cells]
+    moved = [mesh.points + u + part * more.reshape(u.shape) for u, more in zip(at.point.states, grown, strict=True)]
+    shown = np.mean([signed_volumes(replace(mesh, points=points))[cells].sum() for points in moved]) / volumes.sum() - 1.0
+    lame, shear = (np.average(moduli[cells], weights=volumes) for moduli in moduli_of(at.model.zones, at.point.theta))
+    held_back = abs(part - shown)
+    return bool(held_back > MOST_HELD_BACK * abs(part) and held_back * (lame + 2.0 / 3.0 * shear) > shear)
