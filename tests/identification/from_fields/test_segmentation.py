@@ -7,11 +7,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from naibu.identification.from_fields.forward.load_cases import Zones
+from naibu.core.displacement_field import DisplacementField
+from naibu.identification.from_fields.forward.load_cases import FieldLoadCase, Zones
 from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, logarithms, young_and_poisson
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds, first_point
 from naibu.identification.from_fields.inversion.regularization import ZoneGraph
 from naibu.identification.from_fields.regions.merging import CLEAR, merged
+from naibu.identification.from_fields.regions.relative_map import identify_relative_map
 from naibu.identification.from_fields.regions.segmentation import (
     Criterion,
     areas_between,
@@ -22,6 +24,7 @@ from naibu.identification.from_fields.regions.segmentation import (
 )
 from naibu.meshing.primitives import box
 from naibu.reproduction.chapter3.bodies import LAYERS, cube
+from naibu.validation.specimens.quadratic_body import QuadraticBody
 
 MESH = box((40.0, 40.0, 40.0), (4, 4, 4), cell_type="tetra")
 ZONES = Zones.of(MESH, known={}, each_cell=True)
@@ -163,3 +166,17 @@ def test_two_layers_come_out_of_a_blurred_field() -> None:
     assert young[order] == pytest.approx([0.25, 0.5], rel=0.01)
     assert poisson[order] == pytest.approx([0.43, 0.38], abs=0.003)
     assert found.zones.names == ("segment 1", "segment 2")
+
+
+def test_layers_that_only_errors_of_large_cells_contradict_are_regions() -> None:
+    """A map of many moduli makes up for errors of cells of 10 mm, two layers cannot; on smaller cells they explain the data."""
+    solved = QuadraticBody("cube", unknown=(5.0, 0.45), known=(15.0, 0.45)).solved((0.0, 0.0, -4.0), divisions=8)
+    mesh, loaded = QuadraticBody("cube").model(4, "hexahedron")
+    rng = np.random.default_rng(1)
+    points, u = solved.at(rng.uniform(0.02, 0.98, (600, 3)))
+    sd = 0.002 * float(np.linalg.norm(u, axis=1).max())
+    field = DisplacementField.from_arrays(points, u + sd * rng.standard_normal(u.shape), sd_mm=sd)
+    found = identify_relative_map(mesh, [FieldLoadCase.of("push", field, mesh, loaded=loaded)], law="linear")
+    assert found.zones.count == 2
+    low, high = found.intervals()[0][1]
+    assert low < 1.0 / 3.0 < high < 0.6

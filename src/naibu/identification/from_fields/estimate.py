@@ -46,6 +46,7 @@ from naibu.identification.from_fields.inversion.gauss_newton import (
 from naibu.identification.from_fields.inversion.regularization import Regularization, RegularizationName, ZoneGraph, regularization
 from naibu.identification.from_fields.inversion.regularization_weight import WeightChoice, WeightRule, WeightTrial, choose_weight
 from naibu.identification.from_fields.inversion.truncated_newton import truncated_step
+from naibu.identification.from_fields.mesh_error import misfit_on_finer_mesh
 from naibu.identification.from_fields.region_estimate import EstimateSettings, RegionFit, region_estimate
 from naibu.identification.from_fields.regions.border_refinement import (
     MOST_REGIONS,
@@ -334,6 +335,8 @@ class _Recipe:
         self.record(
             f"{regions.clusters} clusters made {count} regions ({regions.moved} zones changed sides): misfit {misfit:.4g} without penalty"
         )
+        if misfit > limit:  # a map of many moduli makes up for errors of cells, regions cannot
+            misfit = self._on_finer_mesh(regions) or misfit
         if misfit > limit:
             self.record(f"the regions leave more unexplained than noise would ({limit:.4g}): the regularised field is the result")
             return replace(self._as_map(field, NO_REGIONS), segmentation=regions)
@@ -346,6 +349,15 @@ class _Recipe:
             sharp, weights=field.weights, regularized=field.regularized, resolution=field.resolution, segmentation=regions,
             identifiability=(*sharp.identifiability, *field.identifiability),
         )  # fmt: skip
+
+    def _on_finer_mesh(self, regions: Segmentation) -> float | None:
+        """Return chi squared of regions on cells of half the size, None where there are none."""
+        if self.elements != "accurate" or not self.model.averaged:
+            return None
+        misfit = misfit_on_finer_mesh(self.model.with_zones(regions.zones), regions.point, self.law)
+        if misfit is not None:
+            self.record(f"the regions on cells of half the size: misfit {misfit:.4g}")
+        return misfit
 
     def _with_borders(self, regions: Segmentation, graph: ZoneGraph) -> FieldEstimate:
         """Return the fit of regions whose borders run through cells, where there are few regions in a map of single cells."""
@@ -408,8 +420,8 @@ class _Recipe:
             if accurate.points.size <= MOST_UNKNOWNS:
                 found = search(accurate, first_point(accurate, point.theta), Objective(bounds=self.bounds))
                 self.record(f"fit of {zones.count} regions with quadratic elements: misfit {found.point.misfit:.4g}")
-                return self._estimate(accurate, found.point, found.status, refined)
-        return self._estimate(model, model.evaluate(point.theta, point.states), Status.CONVERGED, refined)
+                return self._estimate(accurate, found.point, found.status, refined, of_map=True)
+        return self._estimate(model, model.evaluate(point.theta, point.states), Status.CONVERGED, refined, of_map=True)
 
     def _estimate(
         self,
@@ -418,10 +430,11 @@ class _Recipe:
         status: Status,
         refined: RefinedRegions | None = None,
         corrected: CorrectedRegions | None = None,
+        of_map: bool = False,
     ) -> FieldEstimate:
         """Return moduli that were fitted without a penalty, with their errors."""
         settings = EstimateSettings(self.law, self.elements, self.bounds, self.region_at, self.borders, self.other_mesh)
-        found = region_estimate(RegionFit(model, point, status, refined, corrected), settings)
+        found = region_estimate(RegionFit(model, point, status, refined, corrected, of_map), settings)
         for told in found.steps:
             self.record(told)
         return replace(found, steps=tuple(self.steps))

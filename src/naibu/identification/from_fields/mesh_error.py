@@ -21,8 +21,9 @@ from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import FieldLaw, LawName, computed_mesh, field_law
 from naibu.identification.from_fields.forward.forward_model import Observed, Solvers, equilibrium, settled
 from naibu.identification.from_fields.forward.load_cases import Zones
+from naibu.identification.from_fields.forward.loaded_components import ROUGH_TOLERANCE
 from naibu.identification.from_fields.forward.refinement import Refinement
-from naibu.identification.from_fields.forward.sensitivities import Concentrated, Linearised, moduli_of
+from naibu.identification.from_fields.forward.sensitivities import Concentrated, FieldModel, Linearised, Point, moduli_of
 from naibu.meshing.point_location import interpolation_operator
 from naibu.meshing.surface import CELL_FACES
 
@@ -136,11 +137,12 @@ def doubt_of(
 
     Those of ln(kappa / mu) are relative to mu / kappa on the mesh (see `relative_change` and `stretch_of`).
     The error of all moduli has one cause and one sign, unless elements are so coarse that changes say little of what is left. Where zones
-    end inside of cells, the change is that of another law, or the motion of the whole surface is sought, which elements of half the size
-    would find otherwise (`mixed`), it has no order of convergence: what is left may be as large as the change to half the size. If regions
-    are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for less than `ITSELF` times as
-    much. Logarithms that the measurement does not determine move at no cost to the fit, and tell nothing of others: only those that are
-    `sure` (2 count,) count as the worst, by `weight` (2 count,) of `weight_of_change`, and each gets at least the doubt of its own change.
+    end inside of cells or are regions of a map, the change is that of another law, or the motion of the whole surface is sought, which
+    elements of half the size would find otherwise (`mixed`), it has no order of convergence: what is left may be as large as the change to
+    half the size. If regions are one cell thick, no change is taken for less than `THIN`, and of the zones `thin` (count,) that are, for
+    less than `ITSELF` times as much. Logarithms that the measurement does not determine move at no cost to the fit, and tell nothing of
+    others: only those that are `sure` (2 count,) count as the worst, by `weight` (2 count,) of `weight_of_change`, and each gets at least
+    the doubt of its own change.
     """
     told = np.abs(shift if weight is None else weight * shift)[slice(None) if sure is None else sure]
     worst = max(float(told.max(initial=0.0)), 0.0 if thin is None else THIN)
@@ -213,6 +215,15 @@ def refitted(
     moved = at.forward(of_theta[:, None], [-(x @ step)[:, None] - b for x, b in zip(quadratic.response, offset, strict=True)])
     left = tuple(r + (o.operator @ u)[:, 0] for o, r, u in zip(observed, residuals, moved, strict=True))
     return Refit(step, left, tuple(u.reshape(state.shape) for u, state in zip(moved, at.point.states, strict=True)))
+
+
+def misfit_on_finer_mesh(model: FieldModel, point: Point, law: LawName) -> float | None:
+    """Return chi squared of a fit moved to cells of half the size by a Gauss-Newton step; None where there are no such cells."""
+    at = model.linearised(model.evaluate(point.theta, point.states))
+    finer = changes_on_finer_mesh(at, law, lambda _, zones: moduli_of(zones, at.point.theta))
+    if finer is None:
+        return None
+    return refitted(at, at.concentrated(np.eye(len(point.theta)), ROUGH_TOLERANCE), finer[0]).misfit
 
 
 def change_of_fit(at: Linearised, quadratic: Concentrated, changes: list[FloatArray]) -> FloatArray:

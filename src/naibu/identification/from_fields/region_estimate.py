@@ -56,6 +56,8 @@ class RegionFit:
         Of a map: regions whose borders run through cells, as these fit them.
     corrected : CorrectedRegions or None
         The same on cells of half the size.
+    of_map : bool
+        Whether the zones are regions of a map: where errors of the elements helped to tell which regions there are.
     """
 
     model: FieldModel
@@ -63,6 +65,7 @@ class RegionFit:
     status: Status
     refined: RefinedRegions | None = None
     corrected: CorrectedRegions | None = None
+    of_map: bool = False
 
     @property
     def freedom(self) -> float:
@@ -223,7 +226,7 @@ def _of_elements(
     if fit.corrected is None:
         layers, apart = np.isin(names, thin) if thin else None, np.isin(names, judged.mesh_dependent)
         change, weight = relative_change(shift), weight_of_change(found.size.theta - shift)
-        mixed = settings.region_at is not None or not found.size.alike or fit.model.surface_sought
+        mixed = settings.region_at is not None or not found.size.alike or fit.model.surface_sought or fit.of_map
         covariance = doubt_in_all(change, sure, found.quadratic.hessian, apart, mixed=mixed, thin=layers, weight=weight)
         coarse = bool(sure.any()) and (bool(thin) or float(np.abs(weight * change)[sure].max(initial=0.0)) > COARSE)
     else:
