@@ -2,7 +2,8 @@
 
 The displacement jumps where organs slide, and one smooth field misses it on both sides. Registration of each part by itself, within a mask,
 lets it jump :cite:p:`wu2008`. Parts are told apart by their intensity, and tried by themselves only where one field leaves structures
-apart. They keep their fields where these differ, at the surface that the parts share, by more than both are uncertain by.
+apart. They keep their fields where these differ, at the surface that the parts share, by more than both are uncertain by, and bring
+structures no less together than the one field does.
 """
 
 from __future__ import annotations
@@ -61,8 +62,8 @@ def correlated_parts(
     Returns
     -------
     tuple of (ndarray of shape (nz, ny, nx), CorrelationResult)
-        Voxels of parts, all of them if their fields differ where they meet, or the own field of one leaves less apart, but for those that
-        cannot be measured by themselves; none where the object moves as one, or has one intensity only.
+        Voxels of parts, all of them if their fields differ where they meet and leave no more apart than one field, or the own field of one
+        leaves less apart, but for those that cannot be measured by themselves; none where the object moves as one, or has one intensity only.
     """
     if whole.apart_fraction(TRIED_VOXELS) < TRIED:
         return ()
@@ -70,7 +71,7 @@ def correlated_parts(
     if not parts:
         return ()
     shown = intensity_parts(deformed, mask_in_view(deformed, fields_of_view(reference, deformed)[1]))
-    found, left = [], []
+    found, left, size = [], [], []
     for part, there in zip(parts, shown or (None,) * len(parts), strict=True):
         try:
             own = correlate_volumes(reference, deformed, mask=part, deformed_mask=there, least_matched=LEAST_MATCHED, progress=progress)
@@ -79,12 +80,22 @@ def correlated_parts(
         found.append((part, own))
         answered = part & own.valid
         left.append((_left_apart(own, answered), _left_apart(whole, answered)))
-    jumping = len(found) == len(parts) and jump_fraction(*found) > JUMPING
+        size.append(int(answered.sum()))
+    jumping = len(found) == len(parts) and together_leave_less(left, size) and jump_fraction(*found) > JUMPING
     if not jumping and whole.misplaced_fraction < APART:
         return ()
     little = TRIED_VOXELS * float(np.prod(reference.spacing_mm)) ** (1.0 / 3.0)
     chosen = with_own_field(left, jumping=jumping, little_mm=little)
     return tuple(each for each, own in zip(found, chosen, strict=True) if own)
+
+
+def together_leave_less(left_mm: Sequence[tuple[float, float]], voxels: Sequence[int]) -> bool:
+    """Return whether the own fields of parts with so many voxels leave no more apart, all together, than that of the whole does.
+
+    The fields of parts that move as one differ, too, where one of them has lost its way; that of the whole is then the better one.
+    """
+    own, one = np.average(np.asarray(left_mm, dtype=float), axis=0, weights=voxels) if sum(voxels) else (np.nan, np.nan)
+    return bool(own <= one)
 
 
 def with_own_field(left_mm: Sequence[tuple[float, float]], *, jumping: bool = False, little_mm: float = 0.0) -> list[bool]:
