@@ -71,7 +71,8 @@ def correlated_parts(
     -------
     tuple of (ndarray of shape (nz, ny, nx), CorrelationResult)
         Voxels of parts, all of them if their fields differ where they meet and leave no more apart than one field, or the own field of
-        one leaves less apart, but for those that cannot be measured by themselves; none where the object moves as one, or has one intensity only.
+        one leaves less apart, but for those that cannot be measured by themselves; none where the object moves as one, or has one
+        intensity only.
     """
     if whole.apart_fraction(TRIED_VOXELS) < TRIED:
         return ()
