@@ -2,8 +2,7 @@
 
 The displacement jumps where organs slide, and one smooth field misses it on both sides. Registration of each part by itself, within a mask,
 lets it jump :cite:p:`wu2008`. Parts are told apart by their intensity, and tried by themselves only where one field leaves structures
-apart. They keep their fields where these differ, at the surface that the parts share, by more than both are uncertain by, and bring
-structures no less together than the one field does. What slides within a part is left out of its field, and not answered.
+apart. They keep their fields where these differ, at the surface that the parts share, by more than both are uncertain by. What slides within a part is left out of its field, and not answered.
 """
 
 from __future__ import annotations
@@ -30,15 +29,18 @@ APART = 0.04
 # empirical: voxels that one field leaves structures apart, and in which fraction of the cells, above which parts are tried. Legs, and
 # chests that move as one, have none; lungs that slide by 5 mm in scans of 3 mm voxels 0.024, those that slide by 11 mm 0.15
 TRIED_VOXELS, TRIED = 0.25, 0.01
-# of the voxels on the surface that two parts share, those where the fields of both differ by more than the 95 % region of their difference;
-# regions of parts that move as one hold more than they state: none of these voxels differs in chests whose lungs do not slide
-JUMPING = 0.02
+# empirical: of the voxels on the surface that two parts share, those where the fields of both differ by more than the 95 % region of their
+# difference. Chests whose lungs do not slide have up to 0.05, those whose lungs slide by 13 mm or more 0.3 to 0.55
+JUMPING = 0.1
 CHI_SQUARED_95 = 7.815  # three degrees of freedom
 # a voxel next to another part may hold as much of that one: at the surface half of it, a voxel away none, a quarter in the mean
 OF_THE_OTHER = 0.25
 # of what one field leaves apart in a part. Where the own field of a part leaves less than that, parts slide on each other, and one field is
 # wrong on both sides of where they do: every part then has its own, unless that leaves so much more that it has lost its way
 LESS, LOST = 0.8, 2.0
+# empirical, voxels: what a field leaves apart without having lost its way. What is in one scan only, at the surface of a part that slides,
+# counts too: up to half a voxel in parts whose fields are right
+LITTLE_VOXELS = 0.5
 # share of a part that has to match: both scans are known to show it. What does not match is not answered, as what slides within it
 LEAST_MATCHED = 0.5
 # empirical: voxels that the own field of a part leaves structures apart, in a fraction `APART` of its cells, above which something slides
@@ -70,9 +72,8 @@ def correlated_parts(
     Returns
     -------
     tuple of (ndarray of shape (nz, ny, nx), CorrelationResult)
-        Voxels of parts, all of them if their fields differ where they meet and leave no more apart than one field, or the own field of
-        one leaves less apart, but for those that cannot be measured by themselves; none where the object moves as one, or has one
-        intensity only.
+        Voxels of parts, all of them if their fields differ where they meet, or the own field of one leaves less apart, but for those
+        that cannot be measured by themselves; none where the object moves as one, or has one intensity only.
     """
     if whole.apart_fraction(TRIED_VOXELS) < TRIED:
         return ()
@@ -80,7 +81,7 @@ def correlated_parts(
     if not parts:
         return ()
     shown = intensity_parts(deformed, mask_in_view(deformed, fields_of_view(reference, deformed)[1]))
-    found, left, size = [], [], []
+    found, left = [], []
     for part, there in zip(parts, shown or (None,) * len(parts), strict=True):
         try:
             own = correlate_volumes(reference, deformed, mask=part, deformed_mask=there, least_matched=LEAST_MATCHED, progress=progress)
@@ -91,11 +92,12 @@ def correlated_parts(
         found.append((part, own))
         answered = part & own.valid
         left.append((_left_apart(own, answered), _left_apart(whole, answered)))
-        size.append(int(answered.sum()))
-    jumping = len(found) == len(parts) and together_leave_less(left, size) and jump_fraction(*found) > JUMPING
+    little = LITTLE_VOXELS * float(np.prod(reference.spacing_mm)) ** (1.0 / 3.0)
+    # a field that has lost its way is no witness of a slide
+    seen = len(found) == len(parts) and all(with_own_field(left, jumping=True, little_mm=little))
+    jumping = seen and jump_fraction(*found) > JUMPING
     if not jumping and whole.misplaced_fraction < APART:
         return ()
-    little = TRIED_VOXELS * float(np.prod(reference.spacing_mm)) ** (1.0 / 3.0)
     chosen = with_own_field(left, jumping=jumping, little_mm=little)
     return tuple(each for each, own in zip(found, chosen, strict=True) if own)
 
@@ -129,15 +131,6 @@ def _brought_together(part: BoolArray, found: CorrelationResult) -> BoolArray:
     most = FAR_VOXELS**2 * float(np.prod(found.volume.spacing_mm)) ** (2.0 / 3.0)
     kept[tuple(at[apart < most].T)] = True
     return large_regions(kept, SMALLEST * part.sum())
-
-
-def together_leave_less(left_mm: Sequence[tuple[float, float]], voxels: Sequence[int]) -> bool:
-    """Return whether the own fields of parts with so many voxels leave no more apart, all together, than that of the whole does.
-
-    The fields of parts that move as one differ, too, where one of them has lost its way; that of the whole is then the better one.
-    """
-    own, one = np.average(np.asarray(left_mm, dtype=float), axis=0, weights=voxels) if sum(voxels) else (np.nan, np.nan)
-    return bool(own <= one)
 
 
 def with_own_field(left_mm: Sequence[tuple[float, float]], *, jumping: bool = False, little_mm: float = 0.0) -> list[bool]:
