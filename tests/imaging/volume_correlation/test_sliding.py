@@ -210,6 +210,18 @@ def test_a_field_that_has_lost_its_way_is_no_witness_of_a_slide(monkeypatch: pyt
     assert correlated_parts(before, after, ball, whole) == ()
 
 
+def test_fields_of_parts_that_leave_less_than_half_a_voxel_are_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is in one scan only, at the surface of parts that slide, is left apart by their own fields, however right they are."""
+    before, after, _, ball = scans(SLIDE_MM, upper=300.0)
+    own = own_fields(SLIDE_MM)
+    fields = iter([replace(f, cell_misplacement=np.where(np.isfinite(f.cell_misplacement), 0.16, np.nan)) for _, f in own])
+    left = {"apart_fraction": lambda _: 0.02, "misplaced_fraction": 0.01, "misplacement_at": lambda at: np.full(len(at), 1e-4)}
+    whole: Any = SimpleNamespace(volume=before, **left)
+    module = importlib.import_module("naibu.imaging.volume_correlation.part_by_part")
+    monkeypatch.setattr(module, "correlate_volumes", lambda *_, **__: next(fields))
+    assert len(correlated_parts(before, after, ball, whole)) == 2
+
+
 def test_parts_that_jump_keep_their_own_field() -> None:
     """But for one that has lost its way by more than a little."""
     assert with_own_field([(1.0, 1.0), (0.9, 1.0)], jumping=True) == [True, True]

@@ -1,8 +1,9 @@
 """Digital volume correlation of parts of an object that slide on each other, such as lungs on the wall of the chest.
 
-The displacement jumps where organs slide, and one smooth field misses it on both sides. Registration of each part by itself, within a mask,
-lets it jump :cite:p:`wu2008`. Parts are told apart by their intensity, and tried by themselves only where one field leaves structures
-apart. They keep their fields where these differ, at the surface that the parts share, by more than both are uncertain by. What slides within a part is left out of its field, and not answered.
+The displacement jumps where organs slide, and one smooth field misses it on both sides. Registration of each part by itself, within a
+mask, lets it jump :cite:p:`wu2008`. Parts are told apart by their intensity, and tried by themselves only where one field leaves
+structures apart. They keep their fields where these differ, at the surface that the parts share, by more than both are uncertain by. What
+slides within a part is left out of its field, and not answered.
 """
 
 from __future__ import annotations
