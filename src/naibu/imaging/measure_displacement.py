@@ -331,7 +331,10 @@ def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> Meas
     valid = np.logical_or.reduce([one.displacement.valid for one in measured])
     blocks = [one.blocks for one in measured if one.blocks is not None]
     each = [np.concatenate([getattr(b, name) for b in blocks]) for name in ("points", "vectors", "covariance")]
-    told = [f"{len(measured)} part(s) of the object, which differ in intensity, have a field of their own: parts slide on each other."]
+    told = [
+        f"{len(measured)} part(s) of the object, which differ in intensity, have a field of their own: parts slide on each other. "
+        "What slides within a part is not answered."
+    ]
     rest = float((inside & ~np.logical_or.reduce([one.mask for one in measured])).sum() / inside.sum())
     if rest > 0.0:
         told.append(

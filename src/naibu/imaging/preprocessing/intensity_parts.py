@@ -8,7 +8,7 @@ from scipy import ndimage
 from naibu.core.arrays import BoolArray
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.bone_mask import otsu_thresholds
-from naibu.imaging.preprocessing.morphology import opened
+from naibu.imaging.preprocessing.morphology import large_regions, opened
 
 SMOOTHING = 1.0  # voxels: standard deviation of the Gaussian before the threshold
 # empirical: thinner structures, such as vessels and what the surface blurs, belong to the part around them; in fractions of the cube root
@@ -51,15 +51,8 @@ def intensity_parts(volume: Volume, mask: BoolArray) -> tuple[BoolArray, ...]:
     voxel = float(np.prod(spacing)) ** (1.0 / 3.0)
     radius = voxel * max(THINNEST * float(mask.sum()) ** (1.0 / 3.0), LEAST_RADIUS)
     # vessels are bright and thin: what is left of the bright part when it is opened, the dark part surrounds; then the other way round
-    dark = _large(opened(mask & ~opened(bright, spacing, radius), spacing, radius), SMALLEST * mask.sum())
-    other = _large(mask & ~dark, SMALLEST * mask.sum())
+    dark = large_regions(opened(mask & ~opened(bright, spacing, radius), spacing, radius), SMALLEST * mask.sum())
+    other = large_regions(mask & ~dark, SMALLEST * mask.sum())
     if not dark.any() or not other.any():
         return ()
     return mask & ~other, other
-
-
-def _large(found: BoolArray, least: float) -> BoolArray:
-    labels, n = ndimage.label(found)
-    kept = np.bincount(labels.ravel(), minlength=n + 1) >= least
-    kept[0] = False
-    return np.asarray(kept[labels])

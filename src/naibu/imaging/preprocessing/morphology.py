@@ -49,3 +49,11 @@ def closed_by_steps(found: BoolArray, steps: int) -> BoolArray:
     """Return a region (nz, ny, nx) closed by so many steps of dilation and as many of erosion; beyond the faces there is none of it."""
     wide = dilated(np.pad(found, steps), steps)
     return ~dilated(~wide, steps)[(slice(steps, -steps),) * 3] if steps else found.copy()
+
+
+def large_regions(mask: BoolArray, least: float) -> BoolArray:
+    """Return a mask (nz, ny, nx) without its connected regions of fewer than so many voxels."""
+    labels, n = ndimage.label(mask)
+    kept = np.bincount(labels.ravel(), minlength=n + 1) >= least
+    kept[0] = False
+    return np.asarray(kept[labels])

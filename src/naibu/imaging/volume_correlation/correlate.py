@@ -320,6 +320,8 @@ class Correlation:
         for k in range(ADAPTATIONS):
             report_progress(self.progress, "weights of the penalties", done=k, total=ADAPTATIONS)
             weights = self.bending, self.dilatation * system.gauss_volume
+            if k:  # the matrix of mixed steps has the curvature of robust weights, which random fields do not
+                fit.assemble(self.c, *weights)
             settled = self.reweigh(fit.samples(self.c, *weights, ADAPTATION_SAMPLES, None, s.seed, SAMPLE_TOLERANCE))
             steps = Iterations(ADAPTED_STEPS, unsettled=UNSETTLED, mixed=True)
             self.c = fit.iterate(self.c, self.bending, self.dilatation * system.gauss_volume, steps)

@@ -160,6 +160,11 @@ class CorrelationFit(IntensityComparison):
                 break
         return c
 
+    def assemble(self, c: FloatArray, bending: FloatArray, dilatation: FloatArray) -> Float32Array:
+        """Assemble the normal equations of the weights themselves at coefficients c, and return their right side (n, 3)."""
+        self.compare(c)
+        return self.system.assembled(c, self.products, self.force, bending, dilatation)
+
     def compare(self, c: FloatArray) -> None:
         """Warp, weight the residuals at coefficients c, and let rigid inclusions replace those of their voxels."""
         self.system.warped(c, self.value, self.reference_gradient, self.gradient, self.displacement)

@@ -1,8 +1,9 @@
 """Digital volume correlation of parts of an object that slide on each other, such as lungs on the wall of the chest.
 
-The displacement jumps where organs slide, and one smooth field misses it on both sides. Registration of each part by itself, within a mask,
-lets it jump :cite:p:`wu2008`. Parts are told apart by their intensity, and tried by themselves only where one field leaves structures
-apart. They keep their fields where these differ, at the surface that the parts share, by more than both are uncertain by.
+The displacement jumps where organs slide, and one smooth field misses it on both sides. Registration of each part by itself, within a
+mask, lets it jump :cite:p:`wu2008`. Parts are told apart by their intensity, and tried by themselves only where one field leaves
+structures apart. They keep their fields where these differ, at the surface that the parts share, by more than both are uncertain by. What
+slides within a part is left out of its field, and not answered.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from naibu.core.progress import Progress
 from naibu.core.volume import Volume
 from naibu.imaging.preprocessing.field_of_view import fields_of_view
 from naibu.imaging.preprocessing.intensity_parts import intensity_parts
+from naibu.imaging.preprocessing.morphology import large_regions
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
@@ -28,17 +30,27 @@ APART = 0.04
 # empirical: voxels that one field leaves structures apart, and in which fraction of the cells, above which parts are tried. Legs, and
 # chests that move as one, have none; lungs that slide by 5 mm in scans of 3 mm voxels 0.024, those that slide by 11 mm 0.15
 TRIED_VOXELS, TRIED = 0.25, 0.01
-# of the voxels on the surface that two parts share, those where the fields of both differ by more than the 95 % region of their difference;
-# regions of parts that move as one hold more than they state: none of these voxels differs in chests whose lungs do not slide
-JUMPING = 0.02
+# empirical: of the voxels on the surface that two parts share, those where the fields of both differ by more than the 95 % region of their
+# difference. Chests whose lungs do not slide have up to 0.05, those whose lungs slide by 13 mm or more 0.3 to 0.55
+JUMPING = 0.1
 CHI_SQUARED_95 = 7.815  # three degrees of freedom
 # a voxel next to another part may hold as much of that one: at the surface half of it, a voxel away none, a quarter in the mean
 OF_THE_OTHER = 0.25
 # of what one field leaves apart in a part. Where the own field of a part leaves less than that, parts slide on each other, and one field is
 # wrong on both sides of where they do: every part then has its own, unless that leaves so much more that it has lost its way
 LESS, LOST = 0.8, 2.0
+# empirical, voxels: what a field leaves apart without having lost its way. What is in one scan only, at the surface of a part that slides,
+# counts too: up to half a voxel in parts whose fields are right
+LITTLE_VOXELS = 0.5
 # share of a part that has to match: both scans are known to show it. What does not match is not answered, as what slides within it
 LEAST_MATCHED = 0.5
+# empirical: voxels that the own field of a part leaves structures apart, in a fraction `APART` of its cells, above which something slides
+# within it. The walls of chests with livers that slide by 20 to 45 mm have 0.13 to 0.28, halves of balls that slide on each other 0.02
+FAR_VOXELS = 3.0
+# empirical: median of the weights of bending without what slides within a part, over that with it. Without livers the walls of chests have
+# 9 to 42, a ball of which a third is another one in the second scan, which hides nothing of the rest, 1.02
+STIFFER = 2.0
+SMALLEST = 0.02  # of a part: smaller regions that its field brings together may be so by chance
 SAMPLED = 7  # every so many voxels of a part are looked at
 
 
@@ -61,8 +73,8 @@ def correlated_parts(
     Returns
     -------
     tuple of (ndarray of shape (nz, ny, nx), CorrelationResult)
-        Voxels of parts, all of them if their fields differ where they meet, or the own field of one leaves less apart, but for those that
-        cannot be measured by themselves; none where the object moves as one, or has one intensity only.
+        Voxels of parts, all of them if their fields differ where they meet, or the own field of one leaves less apart, but for those
+        that cannot be measured by themselves; none where the object moves as one, or has one intensity only.
     """
     if whole.apart_fraction(TRIED_VOXELS) < TRIED:
         return ()
@@ -74,17 +86,52 @@ def correlated_parts(
     for part, there in zip(parts, shown or (None,) * len(parts), strict=True):
         try:
             own = correlate_volumes(reference, deformed, mask=part, deformed_mask=there, least_matched=LEAST_MATCHED, progress=progress)
+            if own.apart_fraction(FAR_VOXELS) > APART:
+                own = without_what_slides(reference, deformed, part, own, progress)
         except InputError:
             continue  # too small, or without content in common: the field of the whole object stands, and tells that it is uncertain
         found.append((part, own))
         answered = part & own.valid
         left.append((_left_apart(own, answered), _left_apart(whole, answered)))
-    jumping = len(found) == len(parts) and jump_fraction(*found) > JUMPING
+    little = LITTLE_VOXELS * float(np.prod(reference.spacing_mm)) ** (1.0 / 3.0)
+    # a field that has lost its way is no witness of a slide
+    seen = len(found) == len(parts) and all(with_own_field(left, jumping=True, little_mm=little))
+    jumping = seen and jump_fraction(*found) > JUMPING
     if not jumping and whole.misplaced_fraction < APART:
         return ()
-    little = TRIED_VOXELS * float(np.prod(reference.spacing_mm)) ** (1.0 / 3.0)
     chosen = with_own_field(left, jumping=jumping, little_mm=little)
     return tuple(each for each, own in zip(found, chosen, strict=True) if own)
+
+
+def without_what_slides(
+    reference: Volume, deformed: Volume, part: BoolArray, found: CorrelationResult, progress: Progress | None = None
+) -> CorrelationResult:
+    """Return the field of a part without what another field of it leaves apart, such as a liver within the wall of a chest.
+
+    What slides within a part drags its field along, and makes penalties of bending look too strong everywhere: their most probable weights
+    are higher without it. `found` itself is returned where they are not, or too little of the part is left.
+    """
+    kept = _brought_together(part, found)
+    if not kept.any():
+        return found
+    moved = np.median(found.volume.to_index(found.volume.origin_mm + found.displacement.vectors[kept]), axis=0)
+    there = ndimage.shift(kept.astype(np.uint8), np.rint(moved)[::-1], order=0).astype(bool)
+    shown = there if there.any() else None
+    try:
+        rest = correlate_volumes(reference, deformed, mask=kept, deformed_mask=shown, least_matched=LEAST_MATCHED, progress=progress)
+    except InputError:
+        return found
+    return rest if np.nanmedian(rest.bending) > STIFFER * np.nanmedian(found.bending) else found
+
+
+def _brought_together(part: BoolArray, found: CorrelationResult) -> BoolArray:
+    """Return the voxels of a part that a field answers, and does not leave far apart, in regions that are not small."""
+    at = np.argwhere(part & found.valid)
+    apart = found.misplacement_at(found.volume.to_physical(at[:, ::-1]))
+    kept = np.zeros(part.shape, dtype=bool)
+    most = FAR_VOXELS**2 * float(np.prod(found.volume.spacing_mm)) ** (2.0 / 3.0)
+    kept[tuple(at[apart < most].T)] = True
+    return large_regions(kept, SMALLEST * part.sum())
 
 
 def with_own_field(left_mm: Sequence[tuple[float, float]], *, jumping: bool = False, little_mm: float = 0.0) -> list[bool]:
