@@ -11,6 +11,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
+from naibu.io.tables.stated_units import with_short_units, with_stated_units
 from naibu.io.tables.table_cells import HEADER_WITHIN, decimal_mark, excel_rows, number, text_rows, unit_factor, without_unit
 
 TEXT, EXCEL = (".csv", ".tsv", ".txt"), (".xlsx",)
@@ -65,7 +66,8 @@ def read_point_table(path: Path, *, unit: str | None = None, displacements: bool
         ``.csv``, ``.tsv``, ``.txt`` or ``.xlsx``. Columns of position, displacement and standard deviation are recognised by their
         names, in any order; two or three columns of numbers without names are x, y and z.
     unit : str, optional
-        Unit of lengths: mm, cm, m, um or inch. By default the unit in the column name, else mm.
+        Unit of lengths: mm, cm, m, um or inch. By default the unit in the column name, in a row below the names (TrackMate) or in a column
+        of units (Imaris), else mm.
     displacements : bool
         Whether to read them; otherwise columns that look like them are passed over.
 
@@ -81,8 +83,9 @@ def read_point_table(path: Path, *, unit: str | None = None, displacements: bool
             names = "x_mm, y_mm, z_mm" + displacements * ", ux_mm, uy_mm, uz_mm"
             raise InputError(f"{path}: has no names of columns, and {columns} of them; name them in the first line: {names}")
         rows = [(0, list("xyz"[:columns])), *rows]
+    rows[:HEADER_WITHIN] = [(line, [with_short_units(cell) for cell in row]) for line, row in rows[:HEADER_WITHIN]]
     start, where = _header(path, rows)
-    header, body = rows[start][1], rows[start + 1 :]
+    header, body = with_stated_units(path, rows[start][1], rows[start + 1 :], where["points"])
     where["vectors"] = where["vectors"] if displacements else []
     if not body:
         raise InputError(f"{path}: no rows follow the header {', '.join(header)}")
