@@ -143,3 +143,16 @@ def test_a_word_in_a_row_of_numbers_and_mixed_units_are_refused(tmp_path: Path) 
     path.write_text(IMARIS.replace("9.5,um", "9.5,mm"))
     with pytest.raises(InputError, match="several units"):
         read_point_cloud(path)
+
+
+def test_pixels_need_their_size_and_names_come_before_columns_of_units(tmp_path: Path) -> None:
+    path = tmp_path / "spots.csv"
+    path.write_text(TRACKMATE.replace("micron", "pixel"))
+    with pytest.raises(InputError, match="in voxels; give the size"):
+        read_point_cloud(path)
+    np.testing.assert_allclose(read_point_cloud(path, spacing_mm=(0.1, 0.1, 0.4)).points, [[12.05, 4.425, 1.2], [8.0, 1.275, 3.8]])
+    path.write_text("x_mm,y_mm,z_mm,Unit\n1,2,3,um\n2,3,4,um\n")
+    np.testing.assert_allclose(read_point_cloud(path).points, [[1, 2, 3], [2, 3, 4]])
+    path.write_text("x,y,z\ninf,inf,inf\n1,2,3\n")
+    with pytest.raises(InputError, match="not finite"):
+        read_point_cloud(path)

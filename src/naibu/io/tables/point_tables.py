@@ -11,7 +11,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
-from naibu.io.tables.stated_units import with_short_units, with_stated_units
+from naibu.io.tables.stated_units import in_pixels, with_short_units, with_stated_units
 from naibu.io.tables.table_cells import HEADER_WITHIN, decimal_mark, excel_rows, number, text_rows, unit_factor, without_unit
 
 TEXT, EXCEL = (".csv", ".tsv", ".txt"), (".xlsx",)
@@ -47,7 +47,8 @@ COLUMNS = {axis: _patterns(k, axis, component) for k, (axis, component) in enume
 class PointTable:
     """Positions (n, d), displacements (n, d), standard deviations (n, d), mm, and which points were measured (n,).
 
-    None where the table has no such columns; NaN for blank cells. `in_voxels` says that lengths are in voxels, as SPAM writes them.
+    None where the table has no such columns; NaN for blank cells.
+    `in_voxels` says that lengths are in voxels, as SPAM writes them and TrackMate may.
     """
 
     points: FloatArray
@@ -127,7 +128,8 @@ def assembled(
         valid = _unmasked(path, names, parts["vectors"], lambda at: column(at, None))
     points = parts["points"]
     assert points is not None
-    return PointTable(points, parts["vectors"], parts["sd"], valid, {"zpos", "zdisp"} <= {name.strip().lower() for name in names})
+    in_voxels = {"zpos", "zdisp"} <= {name.strip().lower() for name in names} or any(in_pixels(names[at]) for at in where["points"])
+    return PointTable(points, parts["vectors"], parts["sd"], valid, in_voxels)
 
 
 def _unmasked(path: Path, names: list[str], vectors: FloatArray, column: Callable[[int], FloatArray]) -> BoolArray | None:

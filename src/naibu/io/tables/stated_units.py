@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from naibu.core.errors import InputError
-from naibu.io.tables.table_cells import ABSENT, MM_PER_UNIT
+from naibu.io.tables.table_cells import ABSENT, MM_PER_UNIT, without_unit
 
 _MICRONS = re.compile(r"(?<![a-z])(?:microns?|micromet(?:er|re)s?)(?=[\])]?$)", re.IGNORECASE)
 _BARE = re.compile(r"[\[(]?\s*(?P<unit>[^\])]*?)\s*[\])]?")
 _UNITS = re.compile("units?", re.IGNORECASE)
 _NO_DIGIT = re.compile(r"[^0-9]*[^\W\d_][^0-9]*")
+PIXELS = ("px", "pixel", "pixels", "voxel", "voxels")
 DESCRIBED_BY = 3  # rows below the names, at most: TrackMate's long names, short names and units
 
 
@@ -59,11 +60,16 @@ def with_stated_units(
 
 
 def _is_word(row: list[str], at: int) -> bool:
-    return at < len(row) and row[at].lower() not in ABSENT and _NO_DIGIT.fullmatch(row[at]) is not None
+    return at < len(row) and row[at].lower().lstrip("+-") not in (*ABSENT, "inf", "infinity") and bool(_NO_DIGIT.fullmatch(row[at]))
 
 
 def _state(names: list[str], at: int, told: str = "") -> None:
-    """Add a unit to a column's name, if what is told is a unit of length."""
+    """Add a unit to a column's name that states none, if what is told is a unit of length, or pixels."""
     matched = _BARE.fullmatch(with_short_units(told.strip()))
-    if matched is not None and matched["unit"].lower() in MM_PER_UNIT:
+    if matched is not None and without_unit(names[at]) == names[at] and matched["unit"].lower() in (*MM_PER_UNIT, *PIXELS):
         names[at] = f"{names[at]} ({matched['unit'].lower()})"
+
+
+def in_pixels(name: str) -> bool:
+    """Return whether the name of a column, as `with_stated_units` returns it, says pixels or voxels."""
+    return name.endswith(tuple(f"({unit})" for unit in PIXELS))
