@@ -7,7 +7,7 @@ the clock, which on a shared machine counts what others do. Rows of sessions are
 costs. Jitter is that of a session's single steps while another process keeps a core busy, one after the other or a thousand in a second.
 
 Run: ``MKL_NUM_THREADS=1 OMP_NUM_THREADS=2 python benchmarks/lattice_steps.py [--sizes 8,16,32] [--repeats 20]
-[--construction]``.
+[--construction] [--octrees]``.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from collections.abc import Callable
 import numba
 import numpy as np
 
+from naibu.mechanics.lattices.cpu.element_blocks import Blocks
 from naibu.mechanics.lattices.cpu.engine import LatticeEngine
 from naibu.mechanics.lattices.cpu.session import LatticeSession
 from naibu.mechanics.lattices.model.coefficients import explicit_coefficients
@@ -32,6 +33,7 @@ from naibu.mechanics.lattices.model.state import ConstrainedNodes
 from naibu.mechanics.lattices.simulation.adjoint import push_gradient, recorded_push
 
 SIDE_MM, MASS_KG, STEP_S = 80.0, 0.63, 2e-3
+STEPS = {8: 500, 16: 100}  # in a call, by voxels an edge; 20 of larger ones
 GENTLE = (0.03, 0.002, 0.003)  # K, C1, C2 for which explicit steps of 2 ms are stable
 STIFF = (10.0, 5.0, 10.0)  # within the printed ranges, read in g/s^2 and g/s; far beyond what explicit steps of 2 ms allow
 
@@ -137,7 +139,7 @@ def references(lattice: Lattice, parameters: LatticeParameters, steps: int, repe
 def sizes(n: int, repeats: int) -> None:
     lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
     gentle, stiff = lattice_parameters(lattice, *(p * 8.0 / n for p in GENTLE)), lattice_parameters(lattice, *STIFF)
-    steps = {8: 500, 16: 100}.get(n, 20)
+    steps = STEPS.get(n, 20)
     print(f"{n + 1}^3 nodes, {lattice.n_elements} elements")
     reference = references(lattice, gentle, steps, repeats)
     thread_counts = (1, 2) if lattice.n_elements >= 20_000 else (1,)
@@ -189,11 +191,16 @@ def octrees(n: int, lattice: Lattice, steps: int, repeats: int) -> None:
     def gentle(of: Lattice) -> LatticeParameters:
         return lattice_parameters(of, *(p * 8.0 / n for p in GENTLE))
 
-    classic, _, _ = timed(lattice, gentle(lattice), steps, repeats, method="euler", threads=1)
+    classic, wall, _ = timed(lattice, gentle(lattice), steps, repeats, method="euler", threads=1)
+    regular = Blocks.of(lattice).n_blocks
+    told = f"{classic / regular * 1e6:.1f} ns a block, of whose eight places {lattice.n_elements / (8 * regular):.2f} are filled"
+    row(f"classic {n + 1}^3, explicit, 1 thread", classic, wall, told)
     for kind in (0, 1, 2):
         octree = octree_lattice(box_mask((n,) * 3), SIDE_MM / n, kind, total_mass_kg=MASS_KG)
         cpu, wall, _ = timed(octree, gentle(octree), steps, repeats, method="euler", threads=1)
-        told = f"of classic: time {cpu / classic:.3f}, elements {octree.n_elements / lattice.n_elements:.3f}"
+        blocks = Blocks.of(octree).n_blocks
+        told = f"of classic: time {cpu / classic:.3f}, elements {octree.n_elements / lattice.n_elements:.3f}, "
+        told += f"blocks {blocks / regular:.3f}, of whose eight places {octree.n_elements / (8 * blocks):.2f} are filled"
         row(f"octree type {kind}, explicit, 1 thread", cpu, wall, told)
 
 
@@ -244,6 +251,7 @@ def main() -> None:
     parser.add_argument("--sizes", default="8,16,32", help="voxels an edge")
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--construction", action="store_true", help="only how long lattices and engines take to be made")
+    parser.add_argument("--octrees", action="store_true", help="only explicit steps of octrees beside those of the regular lattice")
     asked = parser.parse_args()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     print(f"{os.cpu_count()} cores, Numba threads {numba.get_num_threads()}, load {load:.1f} at the start")
@@ -251,6 +259,11 @@ def main() -> None:
     if asked.construction:
         for n in chosen:
             construction(n)
+        return
+    if asked.octrees:
+        for n in chosen:
+            lattice = classic_lattice(box_mask((n,) * 3), SIDE_MM / n, total_mass_kg=MASS_KG)
+            octrees(n, lattice, STEPS.get(n, 20), asked.repeats)
         return
     for n in chosen:
         sizes(n, asked.repeats)

@@ -107,3 +107,52 @@ def test_copies_of_a_point_are_left_out_and_counted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cloud.points, POINTS[[0, 1, 2, 3, 4, 5, 6]])
     np.testing.assert_array_equal(cloud.rows, [1, 2, 5, 6, 7, 8, 9])
     assert read_point_cloud(written(tmp_path / "once.csv")).copies == 0
+
+
+TRACKMATE = """LABEL,ID,TRACK_ID,QUALITY,POSITION_X,POSITION_Y,POSITION_Z,POSITION_T,FRAME,RADIUS
+Label,Spot ID,Track ID,Quality,X,Y,Z,T,Frame,Radius
+Label,Spot ID,Track ID,Quality,X,Y,Z,T,Frame,R
+,,,(quality),(micron),(micron),(micron),(sec),,(micron)
+ID7,7,,5.1,120.5,44.25,3.0,0,0,2.5
+ID8,8,,4.9,80.0,12.75,9.5,0,0,2.5
+"""
+IMARIS = """Position
+====================
+Position X,Position Y,Position Z,Unit,Category,Collection,Time,TrackID,ID
+120.5,44.25,3.0,um,Spot,Position,1,,7
+80.0,12.75,9.5,um,Spot,Position,1,,8
+"""
+NAMED = "X (microns),Y (microns),Z (microns)\n120.5,44.25,3.0\n80.0,12.75,9.5\n"
+
+
+@pytest.mark.parametrize("text", [TRACKMATE, IMARIS, NAMED], ids=["TrackMate", "Imaris", "microns"])
+def test_units_are_read_where_microscopy_programs_state_them(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "spots.csv"
+    path.write_text(text)
+    found = read_point_cloud(path)
+    np.testing.assert_allclose(found.points, np.array([[120.5, 44.25, 3.0], [80.0, 12.75, 9.5]]) / 1e3)
+    with pytest.raises(InputError, match="says um, but unit = 'mm'"):
+        read_point_cloud(path, unit="mm")
+
+
+def test_a_word_in_a_row_of_numbers_and_mixed_units_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "spots.csv"
+    path.write_text(TRACKMATE.replace("120.5,44.25", "far,44.25"))
+    with pytest.raises(InputError, match=r"line 5, column .*'far' is not a number"):
+        read_point_cloud(path)
+    path.write_text(IMARIS.replace("9.5,um", "9.5,mm"))
+    with pytest.raises(InputError, match="several units"):
+        read_point_cloud(path)
+
+
+def test_pixels_need_their_size_and_names_come_before_columns_of_units(tmp_path: Path) -> None:
+    path = tmp_path / "spots.csv"
+    path.write_text(TRACKMATE.replace("micron", "pixel"))
+    with pytest.raises(InputError, match="in voxels; give the size"):
+        read_point_cloud(path)
+    np.testing.assert_allclose(read_point_cloud(path, spacing_mm=(0.1, 0.1, 0.4)).points, [[12.05, 4.425, 1.2], [8.0, 1.275, 3.8]])
+    path.write_text("x_mm,y_mm,z_mm,Unit\n1,2,3,um\n2,3,4,um\n")
+    np.testing.assert_allclose(read_point_cloud(path).points, [[1, 2, 3], [2, 3, 4]])
+    path.write_text("x,y,z\ninf,inf,inf\n1,2,3\n")
+    with pytest.raises(InputError, match="not finite"):
+        read_point_cloud(path)

@@ -81,6 +81,8 @@ def read_point_cloud(
         else:
             table = read_point_table(source, unit=unit, displacements=False)
             found, sd = table.points, table.sd
+            if table.in_voxels and spacing_mm is None:
+                raise InputError(f"{source}: its positions are in voxels; give the size of a voxel as `spacing_mm`")
     if spacing_mm is not None:
         voxel = np.asarray(spacing_mm, dtype=float)[: found.shape[1]]
         found, sd = found * voxel, None if sd is None else sd * voxel

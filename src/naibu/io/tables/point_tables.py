@@ -11,6 +11,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.errors import InputError
+from naibu.io.tables.stated_units import in_pixels, with_short_units, with_stated_units
 from naibu.io.tables.table_cells import HEADER_WITHIN, decimal_mark, excel_rows, number, text_rows, unit_factor, without_unit
 
 TEXT, EXCEL = (".csv", ".tsv", ".txt"), (".xlsx",)
@@ -46,7 +47,8 @@ COLUMNS = {axis: _patterns(k, axis, component) for k, (axis, component) in enume
 class PointTable:
     """Positions (n, d), displacements (n, d), standard deviations (n, d), mm, and which points were measured (n,).
 
-    None where the table has no such columns; NaN for blank cells. `in_voxels` says that lengths are in voxels, as SPAM writes them.
+    None where the table has no such columns; NaN for blank cells.
+    `in_voxels` says that lengths are in voxels, as SPAM writes them and TrackMate may.
     """
 
     points: FloatArray
@@ -65,7 +67,8 @@ def read_point_table(path: Path, *, unit: str | None = None, displacements: bool
         ``.csv``, ``.tsv``, ``.txt`` or ``.xlsx``. Columns of position, displacement and standard deviation are recognised by their
         names, in any order; two or three columns of numbers without names are x, y and z.
     unit : str, optional
-        Unit of lengths: mm, cm, m, um or inch. By default the unit in the column name, else mm.
+        Unit of lengths: mm, cm, m, um or inch. By default the unit in the column name, in a row below the names (TrackMate) or in a column
+        of units (Imaris), else mm.
     displacements : bool
         Whether to read them; otherwise columns that look like them are passed over.
 
@@ -81,8 +84,9 @@ def read_point_table(path: Path, *, unit: str | None = None, displacements: bool
             names = "x_mm, y_mm, z_mm" + displacements * ", ux_mm, uy_mm, uz_mm"
             raise InputError(f"{path}: has no names of columns, and {columns} of them; name them in the first line: {names}")
         rows = [(0, list("xyz"[:columns])), *rows]
+    rows[:HEADER_WITHIN] = [(line, [with_short_units(cell) for cell in row]) for line, row in rows[:HEADER_WITHIN]]
     start, where = _header(path, rows)
-    header, body = rows[start][1], rows[start + 1 :]
+    header, body = with_stated_units(path, rows[start][1], rows[start + 1 :], where["points"])
     where["vectors"] = where["vectors"] if displacements else []
     if not body:
         raise InputError(f"{path}: no rows follow the header {', '.join(header)}")
@@ -124,7 +128,8 @@ def assembled(
         valid = _unmasked(path, names, parts["vectors"], lambda at: column(at, None))
     points = parts["points"]
     assert points is not None
-    return PointTable(points, parts["vectors"], parts["sd"], valid, {"zpos", "zdisp"} <= {name.strip().lower() for name in names})
+    in_voxels = {"zpos", "zdisp"} <= {name.strip().lower() for name in names} or any(in_pixels(names[at]) for at in where["points"])
+    return PointTable(points, parts["vectors"], parts["sd"], valid, in_voxels)
 
 
 def _unmasked(path: Path, names: list[str], vectors: FloatArray, column: Callable[[int], FloatArray]) -> BoolArray | None:

@@ -23,7 +23,7 @@ _NAMES = {
     "status": re.compile("status"),
     "note": re.compile("note"),
 }
-_ABSENT = ("", "nan", "na", "n/a", "-", "--", "none", "null")
+ABSENT = ("", "nan", "na", "n/a", "-", "--", "none", "null")
 HEADER_WITHIN = 20
 
 
@@ -142,7 +142,7 @@ def decimal_mark(cells: Iterable[str]) -> str:
 
 def number(where: str, text: str, mark: str) -> float:
     """Return the number in a cell; NaN where it is blank."""
-    if text.lower() in _ABSENT:
+    if text.lower() in ABSENT:
         return math.nan
     # typographic minus sign, and spaces between thousands
     plain = re.sub(r"[\s\u00a0\u202f]", "", text).replace("\u2212", "-")

@@ -170,6 +170,7 @@ def _rows(clouds: Sequence[PointCloud], motion: ParticleMotion) -> tuple[tuple[s
     rows: list[tuple[str, Cell]] = [
         ("particles, reference", len(clouds[0])),
         ("particles, deformed", len(clouds[1])),
+        ("extent of the reference, mm", " x ".join(f"{length:.4g}" for length in np.ptp(clouds[0].points, axis=0))),
         *(row for row in copies if row[1]),
         ("linked", len(motion.links)),
         ("of these trusted", int(trusted.sum())),
