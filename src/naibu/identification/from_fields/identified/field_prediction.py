@@ -17,7 +17,7 @@ import scipy.sparse as sp
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
-from naibu.core.errors import InputError
+from naibu.core.errors import ConvergenceError, InputError
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import registration
 from naibu.identification.from_fields.forward.field_laws import field_law
@@ -25,7 +25,7 @@ from naibu.identification.from_fields.forward.forward_model import Solvers, equi
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
 from naibu.identification.from_fields.forward.modulus_columns import modulus_columns
 from naibu.identification.from_fields.forward.refinement import Refinement
-from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised
+from naibu.identification.from_fields.forward.sensitivities import FieldModel, Linearised, Point
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
 from naibu.identification.from_fields.identified.sides import nodes_of_side
 from naibu.identification.from_fields.inversion.gauss_newton import first_point
@@ -36,8 +36,9 @@ from naibu.meshing.surface import boundary_nodes
 SAMPLES = 48  # of the measurement's noise: standard deviations are known to 10 %
 EXTRAPOLATED = 1.4  # whole error of a displacement over its change to half the element size, as for moduli
 LEAST_POINTS = 20  # near the surface
-STEPS = 6  # Gauss-Newton steps for the displacement of the surface
-STILL = 1e-3  # of the largest displacement: a step that changes it less is the last one
+STEPS = 40  # Gauss-Newton steps for the displacement of the surface, at most
+HALVED = 10  # times that a step is, at most
+STILL = 1e-3  # of the largest displacement, and of misfit and prior: a step that changes either less is the last one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,10 +206,29 @@ def _fitted_surface(model: FieldModel, theta: FloatArray) -> Linearised:
         step = at.loaded_solved([-g[:, None] for g in at.gradient()[1]])
         moved = at.forward(None, step)[0].reshape(point.states[0].shape)
         still = float(np.abs(moved).max()) <= STILL * float(np.abs(point.states[0]).max())
-        point = model.evaluate(theta, [at.point.states[0] + moved])
-        if still or model.law.linear:
+        point = _downhill(at, moved)
+        if still or _objective(point) >= (1.0 - STILL) * _objective(at.point) or model.law.linear:
             break
     return model.linearised(model.evaluate(theta, point.states))
+
+
+def _downhill(at: Linearised, moved: FloatArray) -> Point:
+    """Return the point after a displacement (n, 3), mm, or a part of it, that suits the measurements no worse; that before, if none does.
+
+    The whole of a Gauss-Newton step may turn cells inside out where the surface moves far.
+    """
+    for halved in range(HALVED):
+        try:
+            point = at.model.evaluate(at.point.theta, [at.point.states[0] + 0.5**halved * moved])
+        except ConvergenceError:
+            continue
+        if _objective(point) <= (1.0 + STILL) * _objective(at.point):
+            return point
+    return at.point
+
+
+def _objective(point: Point) -> float:
+    return point.misfit + point.prior
 
 
 def _pulled(at: Linearised, u: FloatArray) -> FloatArray:
