@@ -83,7 +83,7 @@ def test_the_verdict_comes_first_and_decides_the_exit_code(naibu: Run, press: Pr
     assert "do not" in out.splitlines()[0] and "not to be used" in out.splitlines()[-1] and "Converged." not in out
     assert {"model.json", "identification.json", "report.html"} <= set(os.listdir("bad"))
     code, out, _ = naibu("predict", "bad", press.folder, "--state", "pressed_more", "--height-mm", 46, "--out", "bad")
-    assert code == 0 and "the model is doubtful: Not explained" in out
+    assert code == 0 and "The model is doubtful: Not explained" in out
 
 
 def test_compare_keeps_what_it_has_found(naibu: Run, press: Press, monkeypatch: pytest.MonkeyPatch) -> None:

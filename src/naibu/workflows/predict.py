@@ -112,7 +112,7 @@ def predict(
     except ConvergenceError as error:
         raise ConvergenceError(f"{loaded.name}/{name} cannot be solved: {error}") from error
     if calibrated.reservation:
-        prediction = replace(prediction, notes=(f"the model is doubtful: {calibrated.reservation}", *prediction.notes))
+        prediction = replace(prediction, notes=(f"The model is doubtful: {calibrated.reservation}", *prediction.notes))
     if folder is not None:
         written_together(folder, PREDICTION_FILES, lambda at: write_prediction(at, calibrated, prediction))
     return PredictionRun(**{f.name: getattr(prediction, f.name) for f in fields(prediction)}, model=calibrated)

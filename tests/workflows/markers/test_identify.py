@@ -453,7 +453,7 @@ def test_two_tables_upside_down_are_not_explained(experiment_folder: Path, tmp_p
     page = (out / "report.html").read_text(encoding="utf-8")
     assert '<div id="verdict" class="limits">' in page and "One set of parameters" not in page
     prediction = predict.predict(out, experiment_folder, state="pressed", height_mm=50.0)
-    assert "the model is doubtful: Not explained, do not use" in prediction.notes[0]
+    assert "The model is doubtful: Not explained, do not use" in prediction.notes[0]
 
 
 @pytest.mark.slow

@@ -276,7 +276,7 @@ def _notes(
     comparison: Comparison | None,
     measured: bool,
 ) -> tuple[str, ...]:
-    notes = [f"the model is doubtful: {body.reservation}"] if body.reservation else []
+    notes = [f"The model is doubtful: {body.reservation}"] if body.reservation else []
     if motions:
         said = [f"{side} {'held' if not any(u) else f'moved by ({u[0]:g}, {u[1]:g}, {u[2]:g}) mm'}" for side, u in motions.items()]
         notes.append(f"Loading: {', '.join(said)}; these sides stick to their plates, and all other surface is free.")

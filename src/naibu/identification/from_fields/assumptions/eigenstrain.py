@@ -2,9 +2,9 @@
 
 A volume that changes without stress is an eigenstrain (:cite:t:`mura1987`). The displacement that it makes of every material, and of all
 together, is found to first order, moduli and the motion of the loaded nodes following, and how much of it fits best
-(`naibu.identification.from_fields.assumptions.score_test`). Where nearly incompressible material is confined by what the field prescribes,
-hardly anything is seen of a growth, and any error asks for a large one: one of which the field shows less than half, held back by a pressure
-above the shear modulus, is none.
+(`naibu.identification.from_fields.assumptions.score_test`). Where the motion of the surface confines nearly incompressible material,
+hardly anything is seen of a growth, and any error asks for a large one: one of which less than half is seen, held back by a pressure above
+the shear modulus, is none.
 """
 
 from __future__ import annotations
