@@ -122,6 +122,20 @@ def test_a_chain_of_points_that_stick_and_slip_is_solved_with_few_derivatives(fr
     assert (opposite <= 0.0).all()
 
 
+@pytest.mark.parametrize("seed", [1, 6, 11])
+def test_points_that_all_move_one_another_stick_and_slip_in_balance(seed: int) -> None:
+    """Every point moves all others; y = free + W g(y) is checked as it stands, where secants of friction alone find no balance."""
+    count, rng = 30, np.random.default_rng(seed)
+    root = rng.normal(size=(3 * count, 3 * count))
+    stiffness = BODY * (0.3 * np.eye(3 * count) + root @ root.T / count)
+    free = np.column_stack([rng.normal(size=(count, 2)), rng.uniform(-0.2, 1.0, count)])
+    body, law = CondensedContact(factorized(stiffness), np.arange(count), np.full(count, BODY)), RoughWall(0.6, 1e4)
+    force = found_by(body.forces(free, law, free, 1e-4, 3.0, 1e-6))
+    motion = free + np.linalg.solve(stiffness, force.ravel()).reshape(-1, 3)
+    assert body.balanced
+    assert np.abs(law(motion) - force).sum() < 0.005 * np.abs(force).sum()
+
+
 def test_points_of_stiff_and_soft_bodies_that_stick_and_slip_by_turns_find_their_forces() -> None:
     """Bodies with stiffnesses from 1 to 1000 mN/mm in random directions; searched steps of Newton's method solve 26 of these 40."""
     solved = 0

@@ -9,7 +9,8 @@ The derivative of Coulomb friction vanishes along the direction of slip. Steps o
 cease to slip, and points stick and slip by turns. With the secant of the friction instead, the force over the elastic slip, every step
 reduces the energy of friction of a known limit (Kacanov's method :cite:p:`han1997`). One such matrix serves for many steps, which
 Anderson's acceleration mixes :cite:p:`walker2011`. Near its end, where no point changes between sticking and slipping any more, these steps
-creep, and those of Newton's method with the derivative itself end the search.
+creep, and those of Newton's method with the derivative itself end the search. Where points change until the end, the steps of Newton's
+method are cut where the forces that are left do no more work along them.
 
 The tangent of a compressed body may be indefinite without the contact that held its surface. Where that contact slips or opens, and the
 body has moved on, such a tangent has no equilibrium nearby, and forces grow without bound. Springs as stiff as the elements then hold the
@@ -35,7 +36,8 @@ from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedI
 
 EVALUATIONS = 60  # of the contact at most
 CHANGES = 12  # matrices at most
-UNAIDED = 8  # of them before nodes are held back
+UNAIDED = 10  # of them before steps of another kind
+DAMPED = 20  # matrices of these, with the derivative of friction, before nodes are held back
 FAR = 3  # steps that are cut short, after which nodes are held back
 WEAKER = 8.0  # times which springs become weaker where a balance with them is found
 WEAKEST = 0.01  # of the stiffness of the elements: springs that are not made weaker still, but left out
@@ -192,7 +194,7 @@ class CondensedContact:
         most : int
             Matrices at most.
         unaided : int
-            Of them before nodes are held back.
+            Of them before steps of Newton's method that are cut, and after these, nodes are held back.
         until : float
             Time of the thread, s, from which no further matrix is made.
         """
@@ -201,6 +203,8 @@ class CondensedContact:
         while True:
             aided = self._share > 0.0 or most == unaided
             found, balanced = yield from search.near(anchor, most if aided else unaided, EVALUATIONS if aided else FAR)
+            if not (balanced or aided or self.tangent.pairs.n_pairs) and law.slips:
+                found, balanced = yield from search.downhill(found, DAMPED, exact=True)
             self.balanced = balanced or kept is not None
             if balanced and self._share == 0.0:
                 return found.force
@@ -253,7 +257,7 @@ class _Search:
                 if self._consistent(at, ENOUGH):
                     return at, True
                 if changes and body.tangent.pairs.n_pairs:
-                    return (yield from self._downhill(best, DOWNHILL * most))
+                    return (yield from self.downhill(best, DOWNHILL * most))
                 if changes == most or cut_short > far or (changes and time.thread_time() > self.until):
                     break
                 yield
@@ -280,12 +284,13 @@ class _Search:
                 return best, True
         return best, False
 
-    def _downhill(self, at: _Motion, most: int) -> Generator[None, None, tuple[_Motion, bool]]:
+    def downhill(self, at: _Motion, most: int, *, exact: bool = False) -> Generator[None, None, tuple[_Motion, bool]]:
         """Return the best that steps of Newton's method find from a motion, with at most so many matrices, and whether it is a balance.
 
         Hundreds of pairs that open and close at once let such steps go much too far. The energy of pairs without friction is convex: along
         every step, the forces that are left do work until it is least, and there the step ends. They are left of the forces under which a
-        motion is ``y = free + W f``, which a whole step determines.
+        motion is ``y = free + W f``, which a whole step determines. With friction, whose derivative may be `exact`, no such energy exists,
+        but a step that ends there does not carry points past where they begin to stick.
         """
         law, nodes, best, exerted, idle, sizes = self.law, len(self.body.nodes), at, None, 0, [np.inf, at.size]
         floor = _Floor(ROUNDED * self.tolerance_mm)
@@ -294,7 +299,7 @@ class _Search:
                 break
             yield
             law(at.motion)  # its last motion may be another
-            change = law.change().with_springs(self._springs)
+            change = law.change(exact=exact).with_springs(self._springs)
             self.body._changed = changed = ChangedInverse.of(self.body._inverse, change)
             step = -changed.solve(at.left)
             resisted = change.times(step)
