@@ -88,6 +88,7 @@ INCLUSION_STEPS, ADAPTED_STEPS = 3, 5  # Gauss-Newton steps with rigid inclusion
 SEARCHES, RELEASED_STEPS = 2, 2  # for parts that swell, and Gauss-Newton steps after each
 UNSETTLED = 0.05  # fraction of the cells that still move, above which these steps go on: large strains of small volumes need more
 MOST_STIFFER = 2.0  # median factor on the weights of bending, above which they are adapted once more
+MOST_BENDING = 3e3  # times the first weights: a motion that is rigid would have any, and single precision loses the data beside larger ones
 # the last steps are solved more exactly: what is left of a step is an error like any other
 POLISH = Iterations(6, stop_voxels=0.002, tolerance=0.03, mixed=True)
 LEAST_WEIGHT = 1e-3  # of the dilatation weight of the round before
@@ -364,7 +365,8 @@ class Correlation:
         width = WEIGHT_WINDOW * float(self.step.mean())
         self.bending, dilatation = chosen_weights(fit, samples, self.c, bent, common, width, self.kinds, self.dilating)
         # what swells bends about it, more than what it shares its weight with
-        self.bending = np.where(self.dilating[:, None], np.minimum(self.bending, self.weights(fit.system, 1.0)[0]), self.bending)
+        first = self.weights(fit.system, 1.0)[0]
+        self.bending = np.minimum(self.bending, np.where(self.dilating[:, None], 1.0, MOST_BENDING) * first)
         if self.settings.dilatation_penalty:
             # an object that swells as a whole would be held back by all of its cells
             fit.system.ratio = ratio_of_all(fit, self.c, self.most_dilatation)

@@ -347,7 +347,8 @@ def chosen_weights(
     system = fit.system
     bending_energy, dilatation_energy = system.energies(samples, c)
     penalised = _unknowns(system, bending)
-    determined, energy = penalised - bending * bending_energy, system.bending_energy.astype(float)
+    determined = penalised - bending * bending_energy
+    energy = np.maximum(system.bending_energy.astype(float), 0.0)  # of a rigid motion, rounding may be below zero
     out = np.empty_like(bending)
     z, y, x = system.cells[:, 2:].T
     for kind in np.unique(kinds):
