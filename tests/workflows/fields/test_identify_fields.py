@@ -29,7 +29,7 @@ from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import UNKNOWN, QuadraticBody, Solved
 from naibu.workflows.fields import cells_of_map
 from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced, moved_borders, sizes_of_voxels
-from naibu.workflows.fields.identify_fields import identify_fields, table_of_assumptions
+from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields, table_of_assumptions
 from naibu.workflows.fields.known_zones import parse_known_zones
 from naibu.workflows.fields.object_on_cubes import ScannedObject
 
@@ -410,16 +410,31 @@ def test_outliers_and_understated_noise_neither_bend_moduli_nor_blame_the_model(
     assert not {"outliers", "scatter"} & set(" ".join(right.notes).split())
 
 
-def test_a_map_that_no_regions_explain_says_so_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Noise counts as a fifth of what it is: what regions leave is beyond it, and the map under the penalty has no intervals."""
+def map_of_doubtful_noise(folder: Path, monkeypatch: pytest.MonkeyPatch) -> FieldIdentification:
+    """Return the map of a body on few cells, where noise counts as a fifth of what it is: what regions leave is beyond it."""
     monkeypatch.setattr(f"{ScannedObject.__module__}.with_noise_of_neighbours", lambda _, case: (case, 1.0))
     with_stated_noise(folder, 0.2 * SD_MM)
-    run = identify_fields(folder / "stated.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=10.0)
+    return identify_fields(folder / "stated.h5", mask=folder / "labels.mha", each_cell=True, law="linear", element_size_mm=10.0)
+
+
+def test_a_map_that_no_regions_explain_says_so_first(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The map under the penalty has no intervals; smaller cells, on which regions are judged besides, there are none here."""
+    monkeypatch.setattr("naibu.identification.from_fields.estimate.misfit_on_finer_mesh", lambda *_: None)
+    run = map_of_doubtful_noise(folder, monkeypatch)
     assert run.estimate.uncertainty is None and run.notes[0].startswith(f"{NO_REGIONS} The map takes the law for right")
     assert run.unit == "multiples of the median" and "multiples of the median" in run.notes[1]
     volume = np.ones(run.estimate.zones.count)
     above = (run.estimate.young_modulus > 1.0) @ volume / volume.sum()
     assert 0.4 < above < 0.6
+
+
+def test_regions_that_explain_as_much_as_the_map_on_smaller_cells_are_given(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a map of large cells explains better than the two gels do is errors of the cells."""
+    run = map_of_doubtful_noise(folder, monkeypatch)
+    assert run.estimate.verdict is not None and run.estimate.verdict.explanation is not Explanation.EXPLAINED
+    assert run.estimate.zones.count == 2
+    low, high = run.estimate.intervals()[0][int(np.argmin(run.estimate.young_modulus))]
+    assert low < 0.5 < high
 
 
 def test_a_surface_that_noise_folds_is_told_as_such(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,12 +3,13 @@
 A volume that changes without stress is an eigenstrain (:cite:t:`mura1987`). The displacement that it makes of every material, and of all
 together, is found to first order, moduli and the motion of the loaded nodes following, and how much of it fits best
 (`naibu.identification.from_fields.assumptions.score_test`). Where the motion of the surface confines nearly incompressible material,
-hardly anything is seen of a growth, and any error asks for a large one: one of which less than half is seen, held back by a pressure above
-the shear modulus, is none.
+hardly anything is seen of a growth, and any error asks for a large one: one that would raise the pressure of any material by more than its
+shear modulus is none.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,8 @@ from naibu.identification.verdict import Explanation, Verdict
 from naibu.meshing.quality import signed_volumes
 
 MOST_MATERIALS = 12  # that are tried: a solution of every load case each
-MOST_HELD_BACK = 0.5  # part of a growth that the field may not show where the pressure against it is above the shear modulus
+SMALL = 1e-4  # growth for a derivative
+SECOND_ORDER = 0.05  # of a growth: what products with the strain, which are left out, may hold back of it
 WHOLE = "the whole body"
 BY_ITSELF = "changes its volume by itself"
 
@@ -64,6 +66,7 @@ def asked_eigenstrain(test: ScoreTest, variance: float, stretch: FloatArray) -> 
     """
     model = test.at.model
     tried = {name: cells for name, cells in materials_of(model.zones).items() if cells.any()}
+    materials = tuple(tried.values())
     if model.mesh.dimension != 3 or not test.errors.any() or len(tried) > MOST_MATERIALS:
         return None
     if len(tried) > 1:
@@ -72,7 +75,7 @@ def asked_eigenstrain(test: ScoreTest, variance: float, stretch: FloatArray) -> 
     for name, cells in tried.items():
         grown = _grown(test.at, cells)
         asked = test.of_residuals([np.asarray(o.operator @ moved) for o, moved in zip(model.observed, grown, strict=True)])
-        possible[name] = None if asked is None or _held_back(test.at, cells, grown, asked.part) else asked
+        possible[name] = None if asked is None or _held_back(test.at, materials, cells, grown, asked.part) else asked
     best = most_asked(possible, variance)
     return None if best is None else Eigenstrain(best[0], best[1].part, best[1].fall, best[1].shift(stretch))
 
@@ -109,12 +112,22 @@ def _grown(at: Linearised, cells: BoolArray) -> list[FloatArray]:
     return [moved[:, 0] for moved in at.solved(right)]
 
 
-def _held_back(at: Linearised, cells: BoolArray, grown: list[FloatArray], part: float) -> bool:
-    """Return whether cells (m,) show so much less than they grow, `part`, that a pressure above their shear modulus holds it back."""
+def _held_back(at: Linearised, materials: Sequence[BoolArray], cells: BoolArray, grown: list[FloatArray], part: float) -> bool:
+    """Return whether `part`, by which cells (m,) grow, raises the pressure in one of the materials (m,) by more than its shear modulus."""
     mesh = at.model.computed
-    volumes = signed_volumes(mesh)[cells]
-    moved = [mesh.points + u + part * more.reshape(u.shape) for u, more in zip(at.point.states, grown, strict=True)]
-    shown = np.mean([signed_volumes(replace(mesh, points=points))[cells].sum() for points in moved]) / volumes.sum() - 1.0
-    lame, shear = (np.average(moduli[cells], weights=volumes) for moduli in moduli_of(at.model.zones, at.point.theta))
-    held_back = abs(part - shown)
-    return bool(held_back > MOST_HELD_BACK * abs(part) and held_back * (lame + 2.0 / 3.0 * shear) > shear)
+    volumes = signed_volumes(mesh)
+    lame, shear = moduli_of(at.model.zones, at.point.theta)
+
+    def grow(steps: Sequence[FloatArray]) -> FloatArray:
+        """Return the mean growth (m,) of cells under displacements (n, 3) of the load cases, times their volume at rest."""
+        return np.asarray(np.mean([signed_volumes(replace(mesh, points=mesh.points + u)) for u in steps], axis=0) - volumes)
+
+    before = grow(at.point.states)
+    further = grow([u + SMALL * more.reshape(-1, 3) for u, more in zip(at.point.states, grown, strict=True)]) - before
+    after = before + part * (further / SMALL - np.where(cells, volumes, 0.0))
+    for there in materials:
+        of_all = volumes[there].sum()
+        ratio = np.average((lame / shear)[there], weights=volumes[there]) + 2.0 / 3.0
+        if abs(after[there].sum()) - abs(before[there].sum()) > of_all * max(1.0 / ratio, SECOND_ORDER * abs(part)):
+            return True
+    return False
