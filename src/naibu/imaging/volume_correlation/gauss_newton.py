@@ -160,10 +160,10 @@ class CorrelationFit(IntensityComparison):
                 break
         return c
 
-    def assemble(self, c: FloatArray, bending: FloatArray, dilatation: FloatArray) -> Float32Array:
-        """Assemble the normal equations of the weights themselves at coefficients c, and return their right side (n, 3)."""
+    def assemble(self, c: FloatArray, bending: FloatArray, dilatation: FloatArray) -> None:
+        """Assemble the normal equations of the weights themselves at coefficients c."""
         self.compare(c)
-        return self.system.assembled(c, self.products, self.force, bending, dilatation)
+        self.system.assembled(c, self.products, self.force, bending, dilatation)
 
     def compare(self, c: FloatArray) -> None:
         """Warp, weight the residuals at coefficients c, and let rigid inclusions replace those of their voxels."""
