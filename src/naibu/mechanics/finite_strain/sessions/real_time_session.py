@@ -303,11 +303,10 @@ class RealTimeSession(DividedSession):
         if step is None:
             return None
         if not np.isfinite(step).all():  # a tangent that has no factors in single precision
-            if tangent is self._own:
-                self._own = None
-            if tangent is self._earlier:
-                self._kept.drop(tangent)
-                self._release(tangent)
+            used, self._own = self._earlier, None if tangent is self._own else self._own
+            if used is not None and tangent.solver is used.solver:  # which may be turned
+                self._kept.drop(used)
+                self._release(used)
             return None
         rise = elements.pressure_change(tangent.dilatation, step, trial.mismatch)
         scale = 1e-2 * self.engine._extent / self.engine._modulus  # mm/kPa
