@@ -221,7 +221,7 @@ class RealTimeSession(DividedSession):
         if self._duration == self.engine.step and self._vain == 0 and (first is None or first.error > UNLIKELY):
             for kept in self._engine._rest:
                 rest = self._at_rest(kept, moving, inertial) if np.array_equal(kept.held, tangent.held) else None
-                if rest is not None and (first is None or rest.error < first.error):
+                if rest is not None and (first is None or rest.error < NEARER * first.error):
                     yield rest, kept, USUAL
         still, bulk = None, self._engine._elements.bulk
         if still_first or (first is not None and first.finished(bulk, begun=False)):
