@@ -7,7 +7,9 @@ import pytest
 import scipy.sparse as sp
 
 from naibu.core.arrays import FloatArray
+from naibu.core.rigid_transform import rotation_matrix
 from naibu.mechanics.linear_algebra.direct import SuperLUSolver
+from naibu.mechanics.linear_algebra.turned_factors import TurnedFactors
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, ChangedInverse, UpdatedFactors
 
 N = 12
@@ -32,6 +34,22 @@ def test_the_parts_of_the_inverse_are_those_of_the_matrix(dense: FloatArray) -> 
     assert made.covered(np.array([[7, 3], [5, 2]])).tolist() == [[True, False], [True, True]]
     made.add_columns(nodes, amounts, x)
     np.testing.assert_allclose(x, 1.0 + inverse[:, rows] @ amounts.ravel(), atol=1e-6)
+
+
+def test_factors_in_axes_that_have_turned_are_those_of_the_matrix_there(dense: FloatArray) -> None:
+    made, turn, random = factors_of(dense), rotation_matrix(np.array([0.4, -0.9, 0.3])), np.random.default_rng(7)
+    whole = np.kron(np.eye(N), turn)
+    inverse, turned = whole @ np.linalg.inv(dense) @ whole.T, TurnedFactors(made, turn)
+    nodes, amounts, b, x = np.array([7, 2, 9]), random.standard_normal((3, 3)), random.standard_normal(3 * N), np.ones(3 * N)
+    rows = (3 * nodes[:, None] + np.arange(3)).ravel()
+    np.testing.assert_allclose(turned.solve(b), inverse @ b, atol=1e-6)
+    np.testing.assert_allclose(turned.between(nodes), inverse[np.ix_(rows, rows)], atol=1e-6)
+    turned.add_columns(nodes, amounts, x)
+    np.testing.assert_allclose(x, 1.0 + inverse[:, rows] @ amounts.ravel(), atol=1e-6)
+    function = random.standard_normal((4, 3 * N)).astype(np.float32)
+    found = turned.of_columns(nodes, lambda columns: function @ columns, np.zeros((4, 0), dtype=np.float32))
+    np.testing.assert_allclose(found, function @ inverse[:, rows], atol=1e-5)
+    assert turned.covered(np.array([7, 3])).tolist() == made.covered(np.array([7, 3])).tolist() == [True, False]
 
 
 @pytest.mark.parametrize("nodes", [[2, 7], [0, 2, 5], [7, 2]])

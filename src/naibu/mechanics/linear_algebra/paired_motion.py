@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from naibu.core.arrays import FloatArray, IntArray
+from naibu.mechanics.linear_algebra.turned_factors import TurnedFactors
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
 COLUMNS = 96  # that are solved for at once
@@ -72,7 +73,7 @@ class PairedMotion:
         """Number of pairs."""
         return len(self.numbers)
 
-    def under(self, factors: UpdatedFactors, nodes: IntArray) -> NDArray[np.float32]:
+    def under(self, factors: UpdatedFactors | TurnedFactors, nodes: IntArray) -> NDArray[np.float32]:
         """Return the relative motion (p, 3 k) under unit forces on nodes (k,), whose part of the inverse is known."""
 
         def of(columns: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -60,18 +60,27 @@ def test_few_are_kept_where_their_columns_take_much_memory(monkeypatch: pytest.M
 
 
 def test_the_newest_of_the_nearest_is_used() -> None:
-    kept, none = KeptTangents(), np.zeros(0, np.int64)
-    first, second, third = at(0.0), at(4.0), at(8.0)
+    kept, held, none, points = KeptTangents(), np.array([1]), np.zeros(0, np.int64), np.array([[0.0, 0.0, 20.0], [0.0, 0.0, 0.0]])
+    first, second, third = (at(depth, held=(1,)) for depth in (0.0, 4.0, 8.0))
     for tangent in (second, first):
         kept.keep(tangent)
-    assert kept.nearest(pressed(1.0), none, 10.0, [third]) is first
-    assert kept.nearest(pressed(2.2), none, 10.0, [third]) is first  # about as near, and newer
-    assert kept.nearest(pressed(3.0), none, 10.0, [third]) is second
-    assert kept.nearest(pressed(7.0), none, 10.0, [third]) is third
-    assert kept.nearest(pressed(4.0), none, 1e5, [third]) is first  # of a body of 100 m these are one state
-    assert kept.nearest(pressed(1.0), np.array([1]), 10.0, [third]) is None
+    assert kept.nearest(points, pressed(1.0), held, 10.0, [third]) is first
+    assert kept.nearest(points, pressed(2.2), held, 10.0, [third]) is first  # about as near, and newer
+    assert kept.nearest(points, pressed(3.0), held, 10.0, [third]) is second
+    assert kept.nearest(points, pressed(7.0), held, 10.0, [third]) is third
+    assert kept.nearest(points, pressed(4.0), held, 1e5, [third]) is first  # of a body of 100 m these are one state
+    assert kept.nearest(points, pressed(1.0), none, 10.0, [third]) is None
     kept.drop(first)
-    assert kept.nearest(pressed(1.0), none, 10.0, ()) is second
+    assert kept.nearest(points, pressed(1.0), held, 10.0, ()) is second
+
+
+def test_of_a_body_that_nothing_holds_one_that_has_turned_is_as_near() -> None:
+    kept, none, points = KeptTangents(), np.zeros(0, np.int64), np.array([[0.0, 0.0, 20.0], [0.0, 0.0, 0.0]])
+    short, long = at(8.0), at(0.0)
+    for tangent in (long, short):
+        kept.keep(tangent)
+    lying = np.array([[19.0, 0.0, 3.0], [0.0, 0.0, 3.0]]) - points  # 19 mm long, as one of them was when it stood
+    assert kept.nearest(points, lying, none, 10.0, ()) is long
 
 
 def test_a_body_whose_tool_leaves_finds_the_tangents_of_the_way_in() -> None:

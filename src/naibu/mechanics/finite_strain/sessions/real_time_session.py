@@ -221,7 +221,7 @@ class RealTimeSession(DividedSession):
         if self._duration == self.engine.step and self._vain == 0 and (first is None or first.error > UNLIKELY):
             for kept in self._engine._rest:
                 rest = self._at_rest(kept, moving, inertial) if np.array_equal(kept.held, tangent.held) else None
-                if rest is not None and (first is None or rest.error < first.error):
+                if rest is not None and (first is None or rest.error < NEARER * first.error):
                     yield rest, kept, USUAL
         still, bulk = None, self._engine._elements.bulk
         if still_first or (first is not None and first.finished(bulk, begun=False)):
@@ -303,11 +303,10 @@ class RealTimeSession(DividedSession):
         if step is None:
             return None
         if not np.isfinite(step).all():  # a tangent that has no factors in single precision
-            if tangent is self._own:
-                self._own = None
-            if tangent is self._earlier:
-                self._kept.drop(tangent)
-                self._release(tangent)
+            used, self._own = self._earlier, None if tangent is self._own else self._own
+            if used is not None and tangent.solver is used.solver:  # which may be turned
+                self._kept.drop(used)
+                self._release(used)
             return None
         rise = elements.pressure_change(tangent.dilatation, step, trial.mismatch)
         scale = 1e-2 * self.engine._extent / self.engine._modulus  # mm/kPa

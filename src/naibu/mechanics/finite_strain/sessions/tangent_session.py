@@ -18,6 +18,7 @@ from naibu.mechanics.finite_strain.sessions.real_time_model import RealTimeModel
 from naibu.mechanics.finite_strain.sessions.tangents.condensed_contact import CondensedContact
 from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent, TangentThread
 from naibu.mechanics.finite_strain.sessions.tangents.kept_tangents import KeptTangents
+from naibu.mechanics.finite_strain.sessions.tangents.turned_tangent import TurnedTangents
 from naibu.mechanics.finite_strain.sessions.trial_displacement import PASSABLE
 
 PERIOD = 10  # steps after which a tangent is renewed without a thread
@@ -36,6 +37,7 @@ class TangentSession(DynamicSession):
     unbalanced: float = field(init=False, default=0.0)
     _earlier: EarlierTangent | None = field(init=False, default=None)
     _kept: KeptTangents = field(init=False, default_factory=KeptTangents)
+    _turned: TurnedTangents = field(init=False, default_factory=TurnedTangents)
     _thread: TangentThread = field(init=False, default_factory=TangentThread)
     _near: tuple[NearbyContact, ...] = field(init=False, default=())
     _places: tuple[Int32Array, ...] = field(init=False, default=())
@@ -81,15 +83,16 @@ class TangentSession(DynamicSession):
         return np.concatenate([*self.bodies[1:], ahead])
 
     def _current_tangent(self) -> EarlierTangent:
-        """Return the tangent of the state nearest to where the body goes; where there is none for these supports, it is made now."""
+        """Return the tangent of the state nearest to where the body goes, turned as it has; where there is none, it is made now."""
         if (done := self._thread.take()) is not None:
             self._keep(done)
-        at = self.reached
-        known = self._kept.nearest(at.displacement + self.engine.step * at.velocity, self._held(), self.engine._extent, self._engine._rest)
+        at, points = self.reached, self.engine.points
+        there = at.displacement + self.engine.step * at.velocity
+        known = self._kept.nearest(points, there, self._held(), self._engine._extent, self._engine._rest)
         if known is None:
             self._engine._rest[:] = [self._untouched()]
             known, self._seen = self._engine._rest[0], np.zeros_like(self.engine.points)
-        return self._used(known)
+        return self._turned.of(self._used(known), points, there)
 
     def _untouched(self) -> EarlierTangent:
         """Return the tangent of the body at rest without contacts of indenters."""
@@ -154,6 +157,7 @@ class TangentSession(DynamicSession):
         """Use a tangent from now on."""
         if tangent is not self._earlier:
             self._earlier, self._condensed = tangent, None
+            self._turned.forget()
         return tangent
 
     def _held(self) -> IntArray:
@@ -181,5 +185,6 @@ class TangentSession(DynamicSession):
         """Let the solver of a tangent factorize again, unless the tangent is kept for the next session."""
         if tangent is self._earlier:
             self._earlier, self._condensed = None, None
+            self._turned.forget()
         if tangent is not None and not any(tangent is kept for kept in self._engine._rest):
             self._engine._solvers.put(tangent.solver)

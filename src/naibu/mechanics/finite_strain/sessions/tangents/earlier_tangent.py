@@ -17,6 +17,7 @@ from naibu.mechanics.linear_algebra.direct import SuperLUSolver, pardiso_library
 from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.protocols import LinearSolver
 from naibu.mechanics.linear_algebra.schur_complement import PardisoSchurSolver
+from naibu.mechanics.linear_algebra.turned_factors import TurnedFactors
 from naibu.mechanics.linear_algebra.updated_factors import BlockChange, UpdatedFactors
 
 MORE = 160  # nodes beyond those that are asked for, which take less time than another analysis of the pattern
@@ -29,7 +30,7 @@ class EarlierTangent:
 
     Attributes
     ----------
-    factors : UpdatedFactors
+    factors : UpdatedFactors or TurnedFactors
         Of the tangent, with inertia and the contacts of then.
     dilatation : ndarray, shape (m, k, 3)
         Derivatives of the dilatations, see `naibu.mechanics.finite_elements.pressure_elements`.
@@ -51,7 +52,7 @@ class EarlierTangent:
         Pairs of the sides of cuts without friction, along their normals of then, that may open or close.
     """
 
-    factors: UpdatedFactors
+    factors: UpdatedFactors | TurnedFactors
     dilatation: FloatArray
     contact: FloatArray
     held: IntArray

@@ -9,6 +9,7 @@ import numpy as np
 
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
+from naibu.mechanics.finite_strain.sessions.tangents.turned_tangent import rotation_to
 
 MOST = 5  # tangents
 MOST_BYTES = 3e8  # of the columns of their inverses
@@ -39,11 +40,17 @@ class KeptTangents:
         kept, self._kept = self._kept, []
         return kept
 
-    def nearest(self, displacement: FloatArray, held: IntArray, extent_mm: float, older: Iterable[EarlierTangent]) -> EarlierTangent | None:
+    def nearest(
+        self, points: FloatArray, displacement: FloatArray, held: IntArray, extent_mm: float, older: Iterable[EarlierTangent]
+    ) -> EarlierTangent | None:
         """Return the newest of those whose states are about as near as the nearest to a displacement.
+
+        Where nothing is held, states that differ by a rotation are the same.
 
         Parameters
         ----------
+        points : ndarray, shape (n, 3)
+            Nodes in the reference configuration, mm.
         displacement : ndarray, shape (n, 3)
             Of the nodes of the body, mm.
         held : ndarray, shape (h,), int64
@@ -56,7 +63,10 @@ class KeptTangents:
         usable = [t for t in (*older, *self._kept) if np.array_equal(t.held, held)]
         if not usable:
             return None
-        far = [_distance(t.displacement, displacement) for t in usable]
+        if len(held):
+            far = [_distance(t.displacement, displacement) for t in usable]
+        else:
+            far = [rotation_to(points + t.displacement, points + displacement)[1] for t in usable]
         most = max(AS_NEAR * min(far), SAME * extent_mm * np.sqrt(len(displacement)))
         return [t for t, way in zip(usable, far, strict=True) if way <= most][-1]
 
