@@ -114,6 +114,21 @@ def test_where_noise_hides_which_particle_is_which_probabilities_say_so() -> Non
         particle_motion(*half_lost_twice(0.1)[:2])
 
 
+@pytest.mark.parametrize("seed", [21, 22])
+def test_noise_of_a_tenth_of_the_distance_is_answered_where_few_are_lost(seed: int) -> None:
+    rng, n = np.random.default_rng(seed), 2500
+    x = rng.uniform(0.0, 20.0, (n, 3))
+    sd = 0.1 * 20.0 / n ** (1.0 / 3.0)
+    second = rng.permutation(np.flatnonzero(rng.random(n) < 0.85))
+    found = particle_motion(x + sd * rng.standard_normal(x.shape), (x + bulging(x))[second] + sd * rng.standard_normal((len(second), 3)))
+    here, there = found.links.pairs.T
+    right = here == second[there]
+    assert right.mean() > 0.93 and right.sum() > 0.5 * len(second)
+    assert (~right).sum() < np.sum(1.0 - found.links.confidence)
+    of_two = np.linalg.norm(found.field.vectors - bulging(found.field.points), axis=1) / (np.sqrt(2.0) * sd)
+    assert np.median(of_two) < 1.8  # of a vector of standard normal components: 1.54
+
+
 def test_stated_deviations_are_raised_where_residuals_are_larger() -> None:
     x, y, _ = affine(800, 2, (0.02, 0.02, 0.02))
     honest = np.full(x.shape, 0.02 / np.sqrt(2.0))

@@ -140,7 +140,8 @@ def link_markers(
         found = replace(grown, vectors=grown.vectors @ stretch.T, volume=grown.volume * float(np.linalg.det(stretch)))
     links = _reported(found, reference, deformed)
     right = coherence_of_links(reference[links.pairs[:, 0]], deformed[links.pairs[:, 1]])
-    links = replace(links, confidence=right * links.confidence)
+    # links that have grown are judged by residuals around each, which tell noise from chance; where all are assigned at once nothing does
+    links = replace(links, confidence=(right if whole else float(right > 0.0)) * links.confidence)
     smaller, sure = min(len(reference), len(deformed)), float(links.confidence.mean()) if len(links) else 0.0
     kept = links if whole else _likely(links)
     chance = sure < how.min_mean_confidence if len(links) >= FEW_LINKS else len(links) < FEW_LINKED * smaller
