@@ -134,6 +134,18 @@ def test_what_speaks_against_the_law_may_be_elements_where_their_error_is_not_kn
         assert told.startswith(DOES_NOT_FIT) and ("elements are too large" in told) is not known and "that of b 35 % higher" in told
 
 
+@pytest.mark.parametrize(("shift", "named"), [((0.5, 0.0), True), ((1.1, 0.0), False), ((-0.2, -58.0), False)])
+def test_no_law_is_named_with_which_a_modulus_may_be_anything(shift: tuple[float, float], named: bool) -> None:
+    """Where elements were too coarse for a Poisson's ratio of 0.4999, a modulus would be "100 % lower as in a yeoh law"."""
+    theta, plain = np.log([100.0, 8.0]), Uncertainty(np.eye(2), np.diag([0.01, 0.01]))
+    mesh = box((10.0, 10.0, 20.0), (1, 1, 2), layers=[("a", 10.0), ("b", 10.0)], centred=False)
+    zones, none = Zones.of(mesh, known={"a": (10.0, 0.45)}), np.zeros((2, 4))
+    free = FreeLaw(("a", "b"), np.array(shift), np.zeros((2, 2)), none, none, {"yeoh": 1e-9}, settled=False)
+    found, hangs = judged(EXPLAINED, free, zones, theta, plain, elements_known=True)
+    assert found.explanation is Explanation.IN_PART and found.reasons[0].startswith(DOES_NOT_FIT) is named and not hangs
+    assert ("yeoh" in found.reasons[0]) is named and ("smaller elements first" in found.reasons[0]) is not named
+
+
 def test_the_least_probability_of_three_laws_is_corrected_for_three_tries() -> None:
     theta, plain = np.log([100.0, 8.0]), Uncertainty(np.eye(2), np.diag([0.01, 0.01]))
     mesh = box((10.0, 10.0, 20.0), (1, 1, 2), layers=[("a", 10.0), ("b", 10.0)], centred=False)

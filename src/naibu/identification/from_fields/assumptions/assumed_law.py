@@ -20,8 +20,15 @@ from naibu.mechanics.finite_elements.elements import elements
 LEAST_STRAIN = 0.02  # equivalent strain, root mean square, below which forms of the law change stress by 2 per cent at most
 UNLIKELY = 1e-3  # probability of so large a score by chance, below which fields speak against the law
 MODULUS = 0.1  # change of the logarithm of a modulus from which on it matters
+NOT_KNOWN = 1.0  # the same from which on a search from the best fit says nothing of it
 DOES_NOT_FIT = "the law does not fit"
 OR_ELEMENTS = ", or elements are too large, whose errors at finite strain are not known"
+NO_LAW = "no law that was tried explains what is more than noise"
+ELEMENTS_FIRST = (
+    "with its shape sought as well, Young's modulus of {} would be another one by a factor that is not known; too large elements and wrong "
+    "zones look like that: compare with smaller elements first"
+)
+OF_LAW = (DOES_NOT_FIT, NO_LAW)  # beginnings of reasons
 HANGS_ON_LAW = "moduli hang on the assumed law"
 NOT_SOUGHT = "moduli may hang on the assumed law, whose shape could not be sought as well"
 MOST_ZONES = 40  # whose laws are sought: four columns each as long as the displacement
@@ -83,13 +90,17 @@ def judged(
     another law.
     """
     against = _against(free, zones, theta, elements_known=elements_known)
-    if against:
-        judged = judged.in_part(against)
-    return judged, hangs_on_law(judged, free, total, theta)
+    if not against:
+        return judged, hangs_on_law(judged, free, total, theta)
+    return judged.in_part(against), ""
 
 
 def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray, *, elements_known: bool) -> str:
-    """Say that fields ask for another law under which a modulus would be another one by much; empty if they do not."""
+    """Say that fields ask for another law under which a modulus would be another one by much; empty if they do not.
+
+    Of one that would be another by a factor of e or more, the search from the best fit tells nothing but that: errors of elements near
+    incompressibility asked for shapes that no material has.
+    """
     if free is None or not free.found or not free.probabilities:
         return ""
     law, least = min(free.probabilities.items(), key=lambda one: one[1])
@@ -98,6 +109,9 @@ def _against(free: FreeLaw | None, zones: Zones, theta: FloatArray, *, elements_
     changes = told_changes(zones, change)
     if probability > UNLIKELY or not changes:
         return ""
+    if (np.abs(change) >= NOT_KNOWN).any():
+        names = " and ".join(zones.names[i] for i in np.flatnonzero(np.abs(change) >= NOT_KNOWN).tolist())
+        return f"{NO_LAW}: {ELEMENTS_FIRST.format(names)}"
     return (
         f"{DOES_NOT_FIT}{'' if elements_known else OR_ELEMENTS}: fields ask for stress that grows otherwise with strain, as in a {law} "
         f"law; with its shape sought as well, Young's modulus would be another one: {changes}"
@@ -128,13 +142,13 @@ def told_shift(zones: Zones, theta: FloatArray, shift: FloatArray) -> str:
 
 def blamed(judged: Verdict, why: str, *, first: bool) -> Verdict:
     """Return the verdict with another reason; where that comes first, another law is none."""
-    reasons = tuple(reason for reason in judged.reasons if not (first and reason.startswith(DOES_NOT_FIT)))
+    reasons = tuple(reason for reason in judged.reasons if not (first and reason.startswith(OF_LAW)))
     return replace(judged, reasons=reasons).in_part(why, first=first)
 
 
 def hangs_on_law(judged: Verdict, free: FreeLaw | None, total: Uncertainty, theta: FloatArray) -> str:
     """Say, in words that follow "but", whether Young's moduli hang on the law; empty if not, or if the verdict says more of it."""
-    if free is None or any(reason.startswith(DOES_NOT_FIT) for reason in judged.reasons):
+    if free is None or any(reason.startswith(OF_LAW) for reason in judged.reasons):
         return ""
     if not free.found:
         sd = total.of_young_and_poisson(theta)[0]

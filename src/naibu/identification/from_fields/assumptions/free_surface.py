@@ -15,7 +15,7 @@ import numpy as np
 from naibu.core.arrays import FloatArray, IntArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, blamed, told_shift
+from naibu.identification.from_fields.assumptions.assumed_law import OF_LAW, blamed, told_shift
 from naibu.identification.from_fields.assumptions.other_assumptions import changes_on
 from naibu.identification.from_fields.assumptions.scaled_displacements import EXPLAINS
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest, most_asked
@@ -97,7 +97,7 @@ def judged_surface(
     if found is None:
         return judged
     changes = told_shift(zones, theta, found.theta)
-    over_law = next(iter(judged.reasons), "").startswith(DOES_NOT_FIT)
+    over_law = next(iter(judged.reasons), "").startswith(OF_LAW)
     first = found.fall > of_law and (over_law or found.fall > EXPLAINS * beyond_noise)
     if not changes and (judged.explanation is Explanation.EXPLAINED or not (first or found.fall > LEAST_PART * beyond_noise)):
         return judged

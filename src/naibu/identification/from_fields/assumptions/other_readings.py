@@ -19,7 +19,7 @@ from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.mesh import Mesh
 from naibu.core.progress import report_progress
-from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, LEAST_STRAIN, largest_strain, told_shift
+from naibu.identification.from_fields.assumptions.assumed_law import LEAST_STRAIN, OF_LAW, largest_strain, told_shift
 from naibu.identification.from_fields.assumptions.volume_change import mean_gradients
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
@@ -139,7 +139,7 @@ def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, the
     texts = " or ".join(f"{one.text} (chi squared falls by {one.gain:.3g})" for one in better)
     changes = told_shift(zones, theta, better[0].theta)
     why = CHECK.format(texts, f", which would make Young's modulus another one ({changes})" if changes else "")
-    reasons = (reason for reason in judged.reasons if not reason.startswith(DOES_NOT_FIT))  # this explains more than another law
+    reasons = (reason for reason in judged.reasons if not reason.startswith(OF_LAW))  # this explains more than another law
     return replace(judged, reasons=tuple(reasons)).in_part(why)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from naibu.core.arrays import BoolArray, FloatArray
 from naibu.core.mesh import Mesh
-from naibu.identification.from_fields.assumptions.assumed_law import DOES_NOT_FIT, told_changes
+from naibu.identification.from_fields.assumptions.assumed_law import OF_LAW, told_changes
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest, most_asked
 from naibu.identification.from_fields.forward.forward_model import Observed, whitening
 from naibu.identification.from_fields.forward.load_cases import Zones
@@ -80,7 +80,7 @@ def unless_explained(found: Scaling | None, judged: Verdict, of_law: float, of_g
     """
     if found is None or found.fall <= of_geometry:
         return None
-    return None if found.fall <= of_law and any(reason.startswith(DOES_NOT_FIT) for reason in judged.reasons) else found
+    return None if found.fall <= of_law and any(reason.startswith(OF_LAW) for reason in judged.reasons) else found
 
 
 def judged_scaling(
