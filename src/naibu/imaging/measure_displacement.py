@@ -333,7 +333,7 @@ def _joined(measured: Sequence[MeasuredDisplacement], inside: BoolArray) -> Meas
     each = [np.concatenate([getattr(b, name) for b in blocks]) for name in ("points", "vectors", "covariance")]
     told = [
         f"{len(measured)} part(s) of the object, which differ in intensity, have a field of their own: parts slide on each other. "
-        "What slides within a part is not answered, but for its rim, where stated errors may be far too small."
+        "What slides within a part is not answered, nor are thin structures of one part within another."
     ]
     rest = float((inside & ~np.logical_or.reduce([one.mask for one in measured])).sum() / inside.sum())
     if rest > 0.0:
