@@ -11,6 +11,7 @@ from naibu.core.arrays import FloatArray
 from naibu.core.status import Status
 from naibu.identification.from_fields.assumptions import assumed_law
 from naibu.identification.from_fields.assumptions.known_ratios import asked_ratios, doubt_of_ratios
+from naibu.identification.from_fields.assumptions.negative_ratio import asked_negative_ratio, judged_negative_ratio
 from naibu.identification.from_fields.assumptions.other_assumptions import MovedBorder, assumptions, covariance_of
 from naibu.identification.from_fields.assumptions.other_causes import Fitted, OtherCauses
 from naibu.identification.from_fields.assumptions.score_test import ScoreTest
@@ -111,6 +112,7 @@ def region_estimate(fit: RegionFit, settings: EstimateSettings) -> FieldEstimate
     whole = Fitted(test, fit.point, variance, found.stretch, found.size.residuals, found.misfit - fit.freedom, settings.bounds)
     causes = OtherCauses.asked(whole, judged, 0.0 if free is None else free.fall, ratios, of_map=fit.refined is not None)
     judged = causes.judged(judged, model.zones, theta, total, coarse=coarse)
+    judged = judged_negative_ratio(judged, asked_negative_ratio(model, fit.point, variance, settings.bounds), explained.reasons)
     accounted = max(causes.accounted, 0.0 if law is None or free is None else free.fall)
     of_model = doubt_of_model(explained, found.information, found.misfit - fit.freedom, accounted)
     total = total.with_added(causes.covariance(len(theta)) + of_model * np.outer(found.stretch, found.stretch))

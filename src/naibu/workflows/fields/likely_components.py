@@ -90,7 +90,8 @@ def told_doubt(found: VolumeChange) -> str:
     """Return in words that components are perhaps in another order."""
     return (
         f"the volume changes {_times(found.given)} as much as the shape, and would change {_times(found.reordered)} as much if components "
-        f"were in another order. That is right of a sponge or foam; of a gel or tissue, {_mend(found.order)}."
+        "were in another order. That is right of a sponge or foam; or the body changes its volume by itself (uptake of water, drying, "
+        f"growth, temperature), and what is found of its zones may be wrong; of a gel or tissue that does not, {_mend(found.order)}."
     )
 
 

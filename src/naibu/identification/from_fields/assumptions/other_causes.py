@@ -25,6 +25,7 @@ from naibu.identification.from_fields.assumptions.scaled_displacements import (
 )
 from naibu.identification.from_fields.assumptions.score_test import MOST_OF_RATIO, ScoreTest
 from naibu.identification.from_fields.assumptions.sliding_borders import Sliding, asked_sliding, judged_sliding
+from naibu.identification.from_fields.assumptions.unlike_experiments import Difference, asked_difference, judged_difference
 from naibu.identification.from_fields.forward.load_cases import Zones
 from naibu.identification.from_fields.forward.sensitivities import Point
 from naibu.identification.from_fields.inversion.gauss_newton import Bounds
@@ -89,6 +90,7 @@ class OtherCauses:
     sliding : Sliding or None
     surface : SurfacePlace or None
     eigenstrain : Eigenstrain or None
+    difference : Difference or None
     """
 
     of_law: float
@@ -100,6 +102,7 @@ class OtherCauses:
     sliding: Sliding | None
     surface: SurfacePlace | None
     eigenstrain: Eigenstrain | None
+    difference: Difference | None
 
     @property
     def explained(self) -> float:
@@ -107,8 +110,8 @@ class OtherCauses:
         return max(self.of_law, EXPLAINS * self.beyond_noise)
 
     @property
-    def _each(self) -> tuple[Averaging | Scaling | Sliding | SurfacePlace | Eigenstrain | None, ...]:
-        return self.averages, self.scaling, self.sliding, self.surface, self.eigenstrain
+    def _each(self) -> tuple[Averaging | Scaling | Sliding | SurfacePlace | Eigenstrain | Difference | None, ...]:
+        return self.averages, self.scaling, self.sliding, self.surface, self.eigenstrain, self.difference
 
     @property
     def accounted(self) -> float:
@@ -116,7 +119,7 @@ class OtherCauses:
 
         That of one which changes a logarithm by `MOST_OF_RATIO` or more is not known to first order.
         """
-        those = (*self.ratios, self.scaling, self.sliding, self.surface, self.eigenstrain)
+        those = (*self.ratios, self.scaling, self.sliding, self.surface, self.eigenstrain, self.difference)
         each = [one.fall for one in those if one is not None and np.abs(one.theta).max() < MOST_OF_RATIO]
         return max([*each, *(one.gain for one in self.readings if one.likelier)], default=0.0)
 
@@ -144,25 +147,28 @@ class OtherCauses:
         eigenstrain = None if of_map else asked_eigenstrain(test, variance, stretch)
         if eigenstrain is not None and eigenstrain.fall <= max(of_law, of_geometry):
             eigenstrain = None  # what explains more looks like it
-        of_any = max(of_geometry, 0.0 if eigenstrain is None else eigenstrain.fall)
+        difference = asked_difference(test, variance, stretch)
+        of_any = max(of_geometry, *(0.0 if one is None else one.fall for one in (eigenstrain, difference)))
         scaling = unless_explained(asked_scaling(test, variance, stretch), judged, of_law, of_any)
         readings = other_readings(test.at.model, fit.point, max(of_law, of_any), fit.by_elements, variance, fit.bounds)
         of_law = max(of_law, *[one.fall for one in ratios]) if ratios else of_law
         explained = max(of_law, EXPLAINS * fit.beyond_noise)
         averages = None if of_geometry > explained else averages  # neighbours share what a jump or a wrong surface leaves as well
-        return cls(of_law, fit.beyond_noise, ratios, readings, averages, scaling, sliding, surface, eigenstrain)
+        return cls(of_law, fit.beyond_noise, ratios, readings, averages, scaling, sliding, surface, eigenstrain, difference)
 
     def judged(self, judged: Verdict, zones: Zones, theta: FloatArray, total: Uncertainty, *, coarse: bool) -> Verdict:
         """Return the verdict with them, the one that explains most first; see `judged_scaling` for `coarse` elements."""
         judged = judged_readings(judged, self.readings, zones, theta)
         judged = judged_averages(judged_ratios(judged, self.ratios, zones, theta), self.averages, zones, theta)
         judged = judged_scaling(judged, self.scaling, zones, theta, total, self.explained, coarse=coarse)
-        there = [one for one in (self.sliding, self.surface, self.eigenstrain) if one is not None]
+        there = [one for one in (self.sliding, self.surface, self.eigenstrain, self.difference) if one is not None]
         for one in sorted(there, key=lambda each: each.fall):  # the last one that comes first is the first of all
             if isinstance(one, Sliding):
                 judged = judged_sliding(judged, one, zones, theta, self.explained)
             elif isinstance(one, SurfacePlace):
                 judged = judged_surface(judged, one, zones, theta, self.of_law, self.beyond_noise)
+            elif isinstance(one, Difference):
+                judged = judged_difference(judged, one, zones, self.explained)
             else:
                 judged = judged_eigenstrain(judged, one, zones, theta, self.explained)
         return judged
