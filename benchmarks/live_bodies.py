@@ -12,6 +12,7 @@ Run: ``OMP_NUM_THREADS=1 python benchmarks/live_bodies.py [--body demo|11|13] [-
 from __future__ import annotations
 
 import argparse
+import gc
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -331,6 +332,7 @@ def main() -> None:
     given = parser.parse_args()
     body = body_named(given.body)
     print(f"{given.body}: {body.mesh.n_cells} cells, {body.mesh.n_points} nodes; {given.tool}, {given.speed:g} mm/s")
+    gc.freeze()  # as `naibu live` does
     if given.cut:
         cut(body)
         return

@@ -118,7 +118,8 @@ class LivePage {
         this.#button("Whole view", () => this.view.look("oblique"))),
       h("div", { class: "live-grid" },
         h("div", {}, this.stage, this.hint, h("div", { class: "motion-scale" }, this.gradient, this.ticks), this.#viewControls()),
-        h("div", { class: "live-side" }, this.badge, this.message, this.caution, list, this.canvas,
+        h("div", { class: "live-state" }, this.badge, this.message), // on the picture where what stands beside it is too far below
+        h("div", { class: "live-side" }, this.caution, list, this.canvas,
           h("div", { class: "bar" }, this.record, this.#button("▶ Replay", () => this.command("replay")),
             this.#button("Save as a page", () => this.#save()),
             this.#button("Screenshot", () => this.#screenshot())))),

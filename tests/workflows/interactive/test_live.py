@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import time
 from contextlib import closing
@@ -25,7 +26,7 @@ from naibu.mechanics import IndenterVelocity, spherical_indenter
 from naibu.meshing import box
 from naibu.meshing.cutting.swept_blade import swept_blade
 from naibu.simulation import FiniteElementBody, InteractiveSimulation, LatticeBody, RealTimeLoop
-from naibu.workflows import MeshMaterial, TouchableModel, live, tools_for, touchable
+from naibu.workflows import MeshMaterial, TouchableModel, live, tools_for, touchable, touched_loop
 from naibu.workflows.interactive.live import LiveSimulation
 
 
@@ -236,6 +237,11 @@ def test_on_a_phone_one_finger_pushes_and_two_look_closer(tmp_path: Path) -> Non
         page.wait("naibuLive.frame.force[2] < -100 && parseFloat(naibuLive.readout.textContent) > 0.1", 30)
         seen = page.value("(() => { const b = naibuLive.readout.getBoundingClientRect(); return [b.width, b.top, b.bottom]; })()")
         assert seen[0] > 20 and 0 < seen[1] < seen[2] < 844  # the force is seen beside the finger
+        page.value("naibuLive.message.textContent = 'a cut is under way'")
+        boxes = "[naibuLive.stage, naibuLive.badge, naibuLive.message].map((e) => e.getBoundingClientRect()).map((b) => [b.left, b.top, b.right, b.bottom])"
+        stage, *told = page.value(boxes)  # that it is slower than real time, or refused, had stood two screens below
+        for left, top, right, bottom in told:
+            assert stage[0] <= left < right <= stage[2] and stage[1] <= top < bottom <= stage[3]
         page.picture(tmp_path / "phone.png")
         page.touch("touchEnd")
         left, top = page.value("(() => { const b = naibuLive.view.canvas.getBoundingClientRect(); return [b.left, b.top]; })()")
@@ -550,3 +556,15 @@ def test_steps_of_a_lattice_on_the_live_page_are_solved_closely_enough() -> None
     apart = np.linalg.norm(forces[0] - forces[1], axis=1) / np.linalg.norm(forces[1], axis=1).max()
     assert np.sqrt((apart**2).mean()) < 1e-3 and np.quantile(apart, 0.99) < 5e-3
     assert apart[-100:].max() < 5e-3 and np.linalg.norm(forces[1][-1]) > 100.0  # errors do not add up
+
+
+def test_no_frame_waits_for_a_search_for_cycles_in_all_that_was_imported() -> None:
+    """Such a search held the thread that steps a pulled gel for 110 ms, as the loop left out what was there before for devices only."""
+    gc.unfreeze()
+    try:
+        with touched_loop(TouchableModel("Cube", (), touched_lattice(), "mean elongation, %")):
+            searched, frozen = len(gc.get_objects()), gc.get_freeze_count()
+        assert gc.get_freeze_count() == 0
+        assert searched < 0.1 * frozen
+    finally:
+        gc.freeze()  # as `conftest` leaves it

@@ -287,12 +287,12 @@ def _stepped(simulation: InteractiveSimulation, hand: HapticHand | None) -> Iter
     simulation.budget_s, simulation.delay_s = BUDGET_S, DELAY_S if hand is None else 0.0
     with ExitStack() as stack:
         stack.enter_context(threadpool_limits(1, user_api="blas"))  # threads of small matrices wait for one another where cores are busy
+        stack.callback(gc.unfreeze)
+        gc.collect()
+        gc.freeze()  # a collection over all that was imported takes more than 5 ms, and once the thread that steps took 100 ms for it
         if hand is not None:
             stack.callback(sys.setswitchinterval, sys.getswitchinterval())
             sys.setswitchinterval(SWITCH_S)
-            stack.callback(gc.unfreeze)
-            gc.collect()
-            gc.freeze()  # a collection over all that was imported takes more than 5 ms
         loop = stack.enter_context(RealTimeLoop(simulation, hand=hand if single else None))
         if hand is not None and not single:
             contact = LocalContact(simulation.tools, simulation.fastest_mm_s, body_step_s=simulation.frame_s)
