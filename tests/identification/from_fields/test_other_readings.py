@@ -20,6 +20,7 @@ from naibu.identification.from_fields.assumptions.other_readings import (
     PLACED_LATER,
     REVERSED,
     Reading,
+    far_beyond,
     judged_readings,
     likelier,
 )
@@ -135,6 +136,10 @@ def test_what_fits_as_well_is_a_note_and_what_fits_worse_nothing() -> None:
     assert judged_readings(EXPLAINED, [Reading("that", none, -3.0 * DECISIVE)], zones, theta) == EXPLAINED
     by_elements = Reading("this", softer, 4.0 * DECISIVE, beyond_elements=False)  # as what smaller elements explain to within noise
     assert judged_readings(EXPLAINED, [by_elements], zones, theta).reasons == () and likelier([by_elements]) == ()
+    assert not far_beyond(212.0, 163.0, 3.35)  # about a hole that was pulled, where a true field looked exchanged
+    as_well = Reading("this", softer, 4.0 * DECISIVE, far_beyond=False)
+    assert judged_readings(EXPLAINED, [as_well], zones, theta).reasons == () and likelier([as_well]) == (as_well,)
+    assert far_beyond(300.0, 163.0, 3.35) and far_beyond(1.0, 0.0, 3.35)
     against = judged_readings(EXPLAINED, [Reading("this", softer, 4.0 * DECISIVE), Reading("that", none, 2.0 * DECISIVE)], zones, theta)
     assert against.explanation is Explanation.IN_PART
     assert "with this (chi squared falls by 100), which would" in against.reasons[0] and "50 % lower" in against.reasons[0]

@@ -148,6 +148,8 @@ class OtherCauses:
         if eigenstrain is not None and eigenstrain.fall <= max(of_law, of_geometry):
             eigenstrain = None  # what explains more looks like it
         difference = asked_difference(test, variance, stretch)
+        if difference is not None and difference.fall <= max(of_law, of_geometry):
+            difference = None  # at another strain, a body of another law is stiffer as well
         of_any = max(of_geometry, *(0.0 if one is None else one.fall for one in (eigenstrain, difference)))
         scaling = unless_explained(asked_scaling(test, variance, stretch), judged, of_law, of_any)
         readings = other_readings(test.at.model, fit.point, max(of_law, of_any), fit.by_elements, variance, fit.bounds)

@@ -58,7 +58,9 @@ class Reading:
     part : float
         Of what these leave beyond noise, that it explains.
     beyond_elements : bool
-        Whether it explains more of what is left on the mesh than elements of half the size do.
+        Whether it explains more of what is left on the mesh than elements of half the size do: what it changes is part of the intervals.
+    far_beyond : bool
+        Whether it explains far more (`far_beyond`), so that it is named.
     """
 
     text: str
@@ -66,6 +68,7 @@ class Reading:
     gain: float
     part: float = 1.0
     beyond_elements: bool = True
+    far_beyond: bool = True
 
     @property
     def likelier(self) -> bool:
@@ -110,9 +113,17 @@ def other_readings(
             continue
         left = other_law + sum(float(excess[kept].sum()) for excess, (_, kept) in zip(before, moved, strict=True))
         fall = left - sum(float(excess.sum()) for excess in _excess_of_points(other, found))
-        more = fall - other_law > of_elements
-        out.append(Reading(text, found.theta - best.theta, fall / variance, fall / max(left, abs(fall), 1e-300), more))
+        more, far = fall - other_law > of_elements, far_beyond(fall - other_law, of_elements, variance)
+        out.append(Reading(text, found.theta - best.theta, fall / variance, fall / max(left, abs(fall), 1e-300), more, far))
     return tuple(out)
+
+
+def far_beyond(fall: float, of_elements: float, variance: float) -> bool:
+    """Return whether chi squared falls by far more than with elements of half the size, where these leave no more than noise.
+
+    Their error is known to first order only: about a hole whose wall was pulled a true field looked exchanged, for a third more than that.
+    """
+    return fall - of_elements > (DECISIVE * variance if of_elements > 0.0 else 0.0)
 
 
 def likelier(found: Sequence[Reading]) -> tuple[Reading, ...]:
@@ -129,11 +140,11 @@ def covariance_of_readings(found: Sequence[Reading], size: int) -> FloatArray:
 
 def judged_readings(judged: Verdict, found: Sequence[Reading], zones: Zones, theta: FloatArray) -> Verdict:
     """Return the verdict with the readings that fit far better than the fields as they are first, and in a note those that fit as well."""
-    alike = [one.text for one in found if one.gain >= -ALIKE and not one.likelier]
+    alike = [one.text for one in found if one.gain >= -ALIKE and not (one.likelier and one.far_beyond)]
     if alike:
         told = f"The fields would fit as well with {' or '.join(alike)}: that they are neither is taken for given."
         judged = replace(judged, notes=(*judged.notes, told.replace("neither", "not") if len(alike) == 1 else told))
-    better = likelier(found)
+    better = [one for one in likelier(found) if one.far_beyond]
     if not better:
         return judged
     texts = " or ".join(f"{one.text} (chi squared falls by {one.gain:.3g})" for one in better)
