@@ -108,6 +108,23 @@ def test_layers_of_one_cell_are_found_from_any_side(cells: int, told: tuple[str,
         assert one_cell_thick(mesh) == told
 
 
+@pytest.mark.parametrize(
+    ("centre", "semi_axes", "told"),
+    [
+        ((5.0, 5.0, 5.5), (2.1, 2.1, 1.3), ()),  # a ball three cells high, whose rim is one cell high
+        ((5.5, 5.5, 5.5), (2.0, 2.0, 1.75), ()),
+        ((5.5, 5.5, 5.5), (0.4, 0.4, 0.4), ("lump",)),  # one cell
+        ((5.5, 5.5, 5.5), (4.0, 0.6, 0.6), ("lump",)),  # a rod
+        ((5.5, 5.5, 5.5), (4.0, 4.0, 0.6), ("lump",)),  # a disc
+    ],
+)
+def test_the_rim_of_a_ball_is_no_layer_of_one_cell(centre: tuple[float, ...], semi_axes: tuple[float, ...], told: tuple[str, ...]) -> None:
+    mesh = box([10.0] * 3, [10] * 3, centred=False)
+    away = (mesh.points[mesh.cells].mean(axis=1) - centre) / semi_axes
+    region = (np.linalg.norm(away, axis=1) < 1.0).astype(np.int64)
+    assert one_cell_thick(Mesh(mesh.points, mesh.cells, "hexahedron", region, ("gel", "lump"))) == told
+
+
 def test_a_rigid_region_has_cells_wholly_or_not_at_all() -> None:
     """A quarter of bone in a cell would make it twelve times as stiff by logarithms; there is soft material all around it."""
     row = box([24.0, 8.0, 8.0], [3, 1, 1], centred=False)

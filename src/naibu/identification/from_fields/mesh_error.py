@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.sparse as sp
 
-from naibu.core.arrays import BoolArray, FloatArray
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.errors import ConvergenceError
 from naibu.core.mesh import Mesh
 from naibu.identification.from_fields.forward.field_laws import FieldLaw, LawName, computed_mesh, field_law
@@ -105,19 +105,38 @@ def one_cell_thick(mesh: Mesh) -> tuple[str, ...]:
     """Return the names of regions that are one hexahedron thick in a large part, from one side or another.
 
     The displacement in them is linear from border to border; a layer under a surface with unknown forces then bends and shears otherwise
-    than it does, and half the size, with the surface as on the mesh, hardly shows it.
+    than it does, and half the size, with the surface as on the mesh, hardly shows it. The steps of a round region are no layer: a cell
+    counts where most of those of the region beside it are as thin, or where there are none.
     """
-    faces = mesh.cells[:, CELL_FACES["hexahedron"]]  # opposite ones in pairs
-    _, number = np.unique(np.sort(faces.reshape(-1, 4), axis=1), axis=0, return_inverse=True)
-    number = number.ravel()
+    number = _numbered_faces(mesh)
     region = np.repeat(mesh.regions, 6)
     total, squares = np.bincount(number, region), np.bincount(number, region.astype(float) ** 2)
     count = np.bincount(number)
     between = (count == 1) | (squares * count != total**2)  # at the surface, or of two regions
-    alone = between[number].reshape(-1, 3, 2).all(axis=2).any(axis=1)
+    along = between[number].reshape(-1, 3, 2).all(axis=2)
+    sides, as_thin = np.zeros(mesh.n_cells, dtype=np.int64), np.zeros(mesh.n_cells, dtype=np.int64)
+    for here, there in _shared_faces(number, ~between):
+        both = [along[f // 6] & (np.arange(3) != (f % 6 // 2)[:, None]) for f in (here, there)]  # thin across the face that they share
+        np.add.at(sides, here // 6, 1)
+        np.add.at(as_thin, here // 6, both[0].any(axis=1) & both[1].any(axis=1))
+    alone = along.any(axis=1) & ((2 * as_thin > sides) | (sides == 0))
     k = len(mesh.region_names)
     share = np.bincount(mesh.regions, alone, k) / np.maximum(np.bincount(mesh.regions, minlength=k), 1)
     return tuple(name for name, part in zip(mesh.region_names, share, strict=True) if part > ONE_CELL)
+
+
+def _numbered_faces(mesh: Mesh) -> IntArray:
+    """Return the number of every face (6 m,) of hexahedra, opposite ones in pairs, cells that share a face the same."""
+    faces = mesh.cells[:, CELL_FACES["hexahedron"]]
+    return np.asarray(np.unique(np.sort(faces.reshape(-1, 4), axis=1), axis=0, return_inverse=True)[1].ravel())
+
+
+def _shared_faces(number: IntArray, which: BoolArray) -> tuple[tuple[IntArray, IntArray], tuple[IntArray, IntArray]]:
+    """Return the places (k,) in `number` (6 m,) of faces of two cells that `which` holds for, of the one and the other cell, both ways."""
+    order = np.argsort(number, kind="stable")
+    first = np.flatnonzero((number[order][1:] == number[order][:-1]) & which[number[order][1:]])
+    one, other = order[first], order[first + 1]
+    return (one, other), (other, one)
 
 
 def told_of_elements(coarse: bool, thin: Sequence[str]) -> tuple[str, ...]:
