@@ -72,6 +72,11 @@ def test_the_unit_or_frame_in_which_a_field_would_lie_in_the_object_is_named(poi
         case(points)
 
 
+def test_of_few_points_in_the_object_no_other_frame_is_named() -> None:
+    with pytest.raises(InputError, match=r"19 measurements of the field lie in the object, 20 are needed.*one reference scan\?$"):
+        case(POINTS[:19])
+
+
 def test_voxels_are_counted_in_the_scan_that_labels_lie_on() -> None:
     axes = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # voxels along x go to posterior, along y to the right
     scan = Volume.from_array(INSIDE.values, spacing_mm=(2.0, 3.0, 4.0), origin_mm=(-100.0, 50.0, -300.0), direction=axes)

@@ -141,6 +141,22 @@ def test_an_interrupted_sweep_keeps_its_runs_and_goes_on(tmp_path: Path) -> None
         simulate(source, out=out, resume=True)
 
 
+def test_a_sweep_that_never_began_leaves_nothing_behind(tmp_path: Path) -> None:
+    source, out = sweep_file(tmp_path), tmp_path / "out"
+
+    def stop(report: ProgressReport) -> None:
+        if "sweep" in report.stage:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(source, out=out, progress=stop)
+    assert not out.exists()
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="no Dask scheduler"):
+        simulate(source, out=out, cluster="wrong://127.0.0.1:9")
+    assert not out.exists()
+
+
 def test_kept_runs_of_another_sweep_are_refused(tmp_path: Path) -> None:
     source, out = sweep_file(tmp_path), tmp_path / "out"
 

@@ -65,7 +65,7 @@ def read_captured_shapes(sources: Sequence[str | os.PathLike[str]]) -> tuple[Cap
 def _parts(source: str) -> list[CapturedSurface]:
     path, time = _timed(source)
     if not path.exists():
-        raise InputError(f"shapes {source!r}: there is no such file; check the path")
+        raise InputError(f"`shapes` {source!r}: there is no such file; check the path")
     if path.suffix.lower() == ".ply":
         if time is None:
             raise InputError(f"{path}: a PLY file states no time; write 'TIME={path}' with the time of the capture, in s")
@@ -100,7 +100,7 @@ def _timed(source: str) -> tuple[Path, float | None]:
     except ValueError:
         time = np.nan
     if not 0.0 <= time <= LONGEST_S:
-        raise InputError(f"shapes {source!r}: {first!r} is no time in s; write 'TIME=FILE', such as '0.5=shape.ply'")
+        raise InputError(f"`shapes` {source!r}: {first!r} is no time in s; write 'TIME=FILE', such as '0.5=shape.ply'")
     return Path(rest), time
 
 

@@ -75,7 +75,7 @@ def _records(source: str) -> list[ForceRecord]:
     name, mark, rest = source.partition("=")
     path = Path(rest if mark and not Path(source).exists() else source)
     if not path.exists():
-        raise InputError(f"forces {source!r}: there is no such file; check the path")
+        raise InputError(f"`forces` {source!r}: there is no such file; check the path")
     given = name.strip() if str(path) != source else ""
     table = read_named_columns(path, _KINDS, _LABELS)
     numbers, labels = table.numbers, table.labels
@@ -88,7 +88,7 @@ def _records(source: str) -> list[ForceRecord]:
     moments = [numbers.get(f"m{a}") for a in "xyz"]
     moment = np.stack([m for m in moments if m is not None], axis=1) if all(m is not None for m in moments) else None
     if labels is not None and given:
-        raise InputError(f"forces {source!r}: the file names the indenter of every row itself; give it without a name")
+        raise InputError(f"`forces` {source!r}: the file names the indenter of every row itself; give it without a name")
     rows = np.array(labels if labels is not None else [given] * len(force))
     return [_one(path, str(label), rows == label, numbers["time"], force, moment) for label in dict.fromkeys(rows.tolist())]
 

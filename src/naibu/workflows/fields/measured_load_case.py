@@ -6,14 +6,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from naibu.core.arrays import FloatArray, IntArray
+from naibu.core.arrays import BoolArray, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
 from naibu.core.mesh import Mesh
 from naibu.core.rigid_transform import registration
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.forward.load_cases import FieldLoadCase
-from naibu.identification.from_fields.identified.sides import loaded_nodes
+from naibu.identification.from_fields.identified.sides import SIDES, loaded_nodes
 from naibu.io.tables.table_cells import MM_PER_UNIT
 from naibu.meshing.point_location import locate
 
@@ -54,6 +54,8 @@ def measured_load_case(
         A field in the plane, hardly a measurement in the object, all of them in a plane, an object that does not deform, or a side that
         does not exist.
     """
+    if unknown := [side for side in sides if side not in SIDES]:
+        raise InputError(f"loaded={unknown[0]!r} is no side of the body; use one of {', '.join(SIDES)}")
     at = field.at_points()
     if at.points.shape[1] != 3:
         raise InputError(f"{name}: positions have {at.points.shape[1]} coordinates; moduli are identified from displacements in space")
@@ -118,14 +120,22 @@ def _likely_frame(points: FloatArray, inside: Volume) -> str:
     tried["with y upwards; take x, -z, y and ux, -uz, uy for x, y, z and ux, uy, uz"] = points[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
     tried["in the order z, y, x; exchange the columns x and z, ux and uz"] = points[:, ::-1]
     tried["in voxels; give spacing_mm"] = inside.to_physical(points)
+    if _within(points, inside).mean() > LIKELY:
+        return ""
     for told, moved in tried.items():
-        index = np.round(inside.to_index(moved)).astype(int)[:, ::-1]
-        there = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
-        there[there] = inside.values[tuple(index[there].T)] != 0
+        share = float(_within(moved, inside).mean())
         extents = np.ptp(moved, axis=0).max(), np.ptp(inside.to_physical(np.argwhere(inside.values)[:, ::-1]), axis=0).max()
-        if there.mean() > LIKELY and extents[0] > LIKELY * extents[1]:
-            return f" {100.0 * there.mean():.0f} % of the points would lie in it if they were {told}."
+        if share > LIKELY and extents[0] > LIKELY * extents[1]:
+            return f" {100.0 * share:.0f} % of the points would lie in it if they were {told}."
     return ""
+
+
+def _within(points: FloatArray, inside: Volume) -> BoolArray:
+    """Return which points (n, 3), mm, lie in voxels that differ from zero."""
+    index = np.round(inside.to_index(points)).astype(int)[:, ::-1]
+    within = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
+    within[within] = inside.values[tuple(index[within].T)] != 0
+    return within
 
 
 def _spans(points: FloatArray) -> str:
@@ -224,10 +234,7 @@ def beyond_rim(name: str, field: DisplacementField, inside: Volume) -> tuple[str
 def _share_beyond(field: DisplacementField, inside: Volume) -> float:
     """Return which part of the points of a field lies where no voxel differs from zero."""
     at = field.at_points()
-    index = np.round(inside.to_index(at.points[at.valid])).astype(int)[:, ::-1]
-    within = np.asarray(((index >= 0) & (index < inside.shape)).all(axis=1))
-    within[within] = inside.values[tuple(index[within].T)] != 0
-    return 1.0 - float(within.mean())
+    return 1.0 - float(_within(at.points[at.valid], inside).mean())
 
 
 def _require_deformation(name: str, field: DisplacementField) -> None:

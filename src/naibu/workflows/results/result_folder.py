@@ -313,7 +313,8 @@ def rewrite_reports(folder: Path) -> list[Path]:
             raise InputError(f"{stored}: {str(error).removeprefix(f'{stored}: ')}; run the command that made it again") from error
         pages.append(write_atomically(stored.with_suffix(".html"), page))
     if not folder.is_dir():
-        raise InputError(f"{folder}: holds no results, for there is no such folder; check the path")
+        what = "a file" if folder.is_file() else "not there"
+        raise InputError(f"{folder}: holds no results, for it is {what}; give the folder of results")
     if not pages:
         stored_as = f"{REPORT_STEM}.json or {PREDICTED_STEM}.json"
         raise InputError(

@@ -160,10 +160,12 @@ def simulate_sweep(
     stopped = False
     try:
         run_tasks(tasks, workers=where, memory_mb=MEMORY_MB, stage=f"sweep {sweep.name}", finished=keep, progress=progress)
-    except KeyboardInterrupt:
-        stopped = True
+    except BaseException as error:
         if not rows:
+            kept.file.remove()  # nothing to go on from
+        if not rows or not isinstance(error, KeyboardInterrupt):
             raise
+        stopped = True
     written = _written(sweep, rows, folder)
     if stopped:
         written = (*written, kept.file.path)
