@@ -49,6 +49,7 @@ def test_factors_in_axes_that_have_turned_are_those_of_the_matrix_there(dense: F
     function = random.standard_normal((4, 3 * N)).astype(np.float32)
     found = turned.of_columns(nodes, lambda columns: function @ columns, np.zeros((4, 0), dtype=np.float32))
     np.testing.assert_allclose(found, function @ inverse[:, rows], atol=1e-5)
+    assert turned.between(nodes[:0]).shape == (0, 0)  # as where nothing is in contact, and nodes are gripped that do not count
     assert turned.covered(np.array([7, 3])).tolist() == made.covered(np.array([7, 3])).tolist() == [True, False]
 
 

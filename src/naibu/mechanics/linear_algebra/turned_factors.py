@@ -51,7 +51,7 @@ class TurnedFactors:
     def between(self, nodes: IntArray) -> NDArray[np.float32]:
         """Return the part of the inverse (3 k, 3 k) between nodes (k,), in the order of columns."""
         part, turn = self.factors.between(nodes), self.rotation.astype(np.float32)
-        rows = np.matmul(turn, part.T.reshape(len(nodes), 3, -1))  # of the transposed part, which lies row by row
+        rows = np.matmul(turn, part.T.reshape(len(nodes), 3, 3 * len(nodes)))  # of the transposed part, which lies row by row
         return np.asarray(rows.reshape(-1, 3) @ turn.T, dtype=np.float32).reshape(part.shape).T
 
     def of_columns(
@@ -61,7 +61,7 @@ class TurnedFactors:
         turn = self.rotation.astype(np.float32)
 
         def of_turned(columns: NDArray[np.float32]) -> NDArray[np.float32]:
-            rows = np.matmul(turn, columns.reshape(-1, 3, columns.shape[1]))
+            rows = np.matmul(turn, columns.reshape(len(columns) // 3, 3, columns.shape[1]))
             return of(rows.reshape(columns.shape))
 
         here = (of_condensed.reshape(-1, 3) @ turn).reshape(of_condensed.shape)
