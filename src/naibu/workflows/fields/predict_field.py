@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from naibu._version import __version__
-from naibu.core.arrays import LENGTHS_MM, FloatArray
+from naibu.core.arrays import LENGTHS_MM, FloatArray, IntArray
 from naibu.core.displacement_field import DisplacementField
 from naibu.core.errors import InputError
+from naibu.core.mesh import Mesh
 from naibu.core.volume import Volume
 from naibu.identification.from_fields.identified.field_prediction import FieldPrediction, predict_inside, predict_moved_sides
 from naibu.identification.from_fields.identified.identified_body import IdentifiedBody
@@ -29,6 +30,7 @@ from naibu.viewer.notebook import ShownInNotebook, empty_figure
 from naibu.viewer.result_figures import draw_slices
 from naibu.viewer.slices import Overlay, SliceView, slices_html
 from naibu.viewer.tables import Table
+from naibu.workflows.fields.measured_load_case import relative_deformation
 from naibu.workflows.results.files_together import written_together
 from naibu.workflows.results.output_folder import no_empty_folders, output_folder
 from naibu.workflows.results.result_folder import read_identified_body
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 FILES = ("predicted.html", "field.h5", "predicted.vtu", "summary.json")
 VOXELS = 60_000  # of the grid on which a prediction is written
 WIDTH = 1.959964  # standard deviations to either side that hold 95 %
+MOST_DEFORMATION = 2.0  # root mean square displacement without the rigid motion, over the extent: of soft bodies hardly ever half of that
 EXTRAPOLATED = 1.5  # times the deformation of the identification, from which a prediction is an extrapolation
 
 
@@ -202,6 +205,7 @@ def predict_field(
         compared = None if measured is None else _inside_of(prediction, measured)
     else:
         assert measured is not None
+        _require_possible(body, measured)
         prediction, inner = predict_inside(body, measured)
         compared = _part(measured, inner)
     identified = field is not None and _identified_from(body, field)
@@ -253,6 +257,22 @@ def _file_of(model: str | os.PathLike[str]) -> Path:
     return Path(model) / "model.json" if Path(model).is_dir() else Path(model)
 
 
+def _near(mesh: Mesh, field: DisplacementField) -> IntArray:
+    """Return which valid measurements lie in the box that a body fills."""
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    return np.flatnonzero(field.valid & ((field.points >= low) & (field.points <= high)).all(axis=1))
+
+
+def _require_possible(body: IdentifiedBody, field: DisplacementField) -> None:
+    """Refuse displacements with which a body would be deformed by more than it is large, as those in another unit do."""
+    near = _near(body.mesh, field)
+    if len(near) > 2 and (share := relative_deformation(_part(field, near))) > MOST_DEFORMATION:
+        raise InputError(
+            f"field: its displacements deform the object by {share:.3g} times its size (root mean square, without the rigid motion), which "
+            "no body follows: are they in mm, as its positions are? Give the columns their unit, such as 'ux [um]'."
+        )
+
+
 def _part(field: DisplacementField, some: Any) -> DisplacementField:
     covariance = None if field.covariance is None else field.covariance[some]
     return DisplacementField.from_arrays(field.points[some], field.vectors[some], covariance=covariance)
@@ -260,8 +280,7 @@ def _part(field: DisplacementField, some: Any) -> DisplacementField:
 
 def _inside_of(prediction: FieldPrediction, field: DisplacementField) -> DisplacementField:
     """Return the valid measurements that lie in the body."""
-    low, high = prediction.mesh.points.min(axis=0), prediction.mesh.points.max(axis=0)
-    near = np.flatnonzero(field.valid & ((field.points >= low) & (field.points <= high)).all(axis=1))
+    near = _near(prediction.mesh, field)
     if len(near):
         near = near[locate(prediction.mesh, field.points[near], tolerance_mm=np.inf).distance_mm <= 1e-6]
     if not len(near):
@@ -288,7 +307,7 @@ def _notes(
         notes.append("The field has no point farther inside than the cells at the surface: nothing to compare with.")
     sd = float(np.median(prediction.standard_deviation))
     parts = "moduli, surface, elements and model misfit" if body.covariance is not None else "surface, elements and model misfit"
-    notes.append(f"A predicted component is known to {sd:.2g} mm (standard deviation, median: {parts}).")
+    notes.append(f"A predicted component is known to {sd:.2g} mm (standard deviation, median of all nodes: {parts}).")
     if loose := _undetermined(body):
         notes.append(
             f"It follows from moduli near those used, and is too small where those of {', '.join(loose)}, which the identification leaves "
@@ -359,7 +378,7 @@ def _page(run: FieldPredictionRun, field: DisplacementField) -> SliceView:
     overlays = [Overlay("displacement, mm", size), Overlay("standard deviation, mm", sd)]
     cards = [
         Card("Largest displacement", f"{np.nanmax(size):.3g} mm"),
-        Card("Standard deviation of a displacement", f"{np.nanmedian(sd):.2g} mm", "median, along the least certain direction"),
+        Card("Standard deviation of a displacement", f"{np.median(run.prediction.standard_deviation):.2g} mm", "of a component, median of all nodes"),
     ]
     if c is not None:
         overlays.append(Overlay("distance of predicted from measured, mm", _of_voxels(grid, c)))

@@ -57,12 +57,13 @@ def _warnings(
         found.append(
             f"With {named} the forces would be met to {after:.3g} instead of {before:.3g} times their noise: "
             f"{_perhaps(problem, diagnosis.errors)}; or the law lacks something that looks alike. Intervals reach to where that would move "
-            f"the estimates. To estimate it along, set sensor_errors to {name!r}."
+            f"the estimates. To estimate it along, give {name!r} as sensor errors (--sensor-errors, sensor_errors)."
         )
     elif diagnosis:
         found.append(
             f"Forces are met better with errors of their sensors ({name}), too small to be told from noise: intervals "
-            f"reach to where these would move the estimates. To estimate them along, set sensor_errors to {name!r}."
+            f"reach to where these would move the estimates. To estimate them along, give {name!r} as sensor errors (--sensor-errors, "
+            "sensor_errors)."
         )
     if unnoticed:
         found.append(
