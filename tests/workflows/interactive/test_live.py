@@ -239,8 +239,8 @@ def test_on_a_phone_one_finger_pushes_and_two_look_closer(tmp_path: Path) -> Non
         assert seen[0] > 20 and 0 < seen[1] < seen[2] < 844  # the force is seen beside the finger
         page.value("naibuLive.message.textContent = 'a cut is under way'")
         boxes = "[naibuLive.stage, naibuLive.badge, naibuLive.message].map((e) => e.getBoundingClientRect())"
-        stage, *told = page.value(f"{boxes}.map((b) => [b.left, b.top, b.right, b.bottom])")  # that it is slower than real time, or refused, had stood two screens below
-        for left, top, right, bottom in told:
+        stage, *told = page.value(f"{boxes}.map((b) => [b.left, b.top, b.right, b.bottom])")
+        for left, top, right, bottom in told:  # slower than real time, or refused: it had stood two screens below
             assert stage[0] <= left < right <= stage[2] and stage[1] <= top < bottom <= stage[3]
         page.picture(tmp_path / "phone.png")
         page.touch("touchEnd")
