@@ -18,6 +18,9 @@ from naibu.workflows.fields.object_on_cubes import ScannedObject
 CUBES = 300  # of the object: components in a wrong order show on coarse ones
 MOST_NAMED = 3  # arrangements that are about as likely
 COMPRESSIBLE = 0.4  # Poisson's ratio of a known zone below which a body may well change its volume
+BY_ITSELF = (
+    "or the body changes its volume by itself (uptake of water, drying, growth, temperature), and what is found of its zones may be wrong"
+)
 UNTOLD = (
     "{}: where forces may act on the whole surface, this field does not tell the signs of single components: its volume changes {:.2g} "
     "times as much as its shape, with another sign of u{} {:.2g} times as much. They are taken as they are; naming the sides at which "
@@ -80,9 +83,9 @@ def told_sign(found: VolumeChange) -> str:
     others = " and ".join(f"u{axis}" for k, axis in enumerate("xyz") if k != found.component)
     return (
         f"the volume changes {_times(found.given)} as much as the shape, and would change {_times(found.flipped)} as much with another "
-        f"sign of u{'xyz'[found.component]}. That is right of a lung, sponge or foam that expands or is squeezed in several directions; of "
-        f"a gel or other tissue, components are not in the frame of the positions: change the sign of u{'xyz'[found.component]}, or else "
-        f"of {others}."
+        f"sign of u{'xyz'[found.component]}. That is right of a lung, sponge or foam that expands or is squeezed in several directions; "
+        f"{BY_ITSELF}; of a gel or tissue that does not, components are not in the frame of the positions: change the sign of "
+        f"u{'xyz'[found.component]}, or else of {others}."
     )
 
 
@@ -90,8 +93,7 @@ def told_doubt(found: VolumeChange) -> str:
     """Return in words that components are perhaps in another order."""
     return (
         f"the volume changes {_times(found.given)} as much as the shape, and would change {_times(found.reordered)} as much if components "
-        "were in another order. That is right of a sponge or foam; or the body changes its volume by itself (uptake of water, drying, "
-        f"growth, temperature), and what is found of its zones may be wrong; of a gel or tissue that does not, {_mend(found.order)}."
+        f"were in another order. That is right of a sponge or foam; {BY_ITSELF}; of a gel or tissue that does not, {_mend(found.order)}."
     )
 
 
