@@ -107,7 +107,7 @@ def test_the_field_that_identified_the_model_is_no_test_of_it(folder: Path, tmp_
 def test_displacements_in_micrometres_are_not_taken_for_errors_of_the_measurement(folder: Path, tmp_path: Path) -> None:
     points, u = solved(SHEARED).at(np.random.default_rng(3).uniform(0.02, 0.98, (400, 3)))
     write_field(tmp_path / "um.h5", DisplacementField.from_arrays(in_scan(points), 1e3 * u @ TURNED.T))
-    with pytest.raises(InputError, match="times its size.*are they in mm"):
+    with pytest.raises(InputError, match=r"times its size.*are they in mm"):
         predict_field(folder / "model", tmp_path / "um.h5")
     page = predict_field(folder / "model", folder / "sheared.h5", out=tmp_path / "out")
     sd = json.loads((tmp_path / "out" / "summary.json").read_text())["median_sd_mm"]  # the page had told another one in its card

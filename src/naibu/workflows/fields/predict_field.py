@@ -375,10 +375,11 @@ def _page(run: FieldPredictionRun, field: DisplacementField) -> SliceView:
     grid, c = field.grid, run.comparison
     size, sd = np.linalg.norm(field.vectors, axis=-1), field.largest_sd_mm
     assert sd is not None
+    known = float(np.median(run.prediction.standard_deviation))
     overlays = [Overlay("displacement, mm", size), Overlay("standard deviation, mm", sd)]
     cards = [
         Card("Largest displacement", f"{np.nanmax(size):.3g} mm"),
-        Card("Standard deviation of a displacement", f"{np.median(run.prediction.standard_deviation):.2g} mm", "of a component, median of all nodes"),
+        Card("Standard deviation of a displacement", f"{known:.2g} mm", "of a component, median of all nodes"),
     ]
     if c is not None:
         overlays.append(Overlay("distance of predicted from measured, mm", _of_voxels(grid, c)))
