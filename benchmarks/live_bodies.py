@@ -256,7 +256,7 @@ def pulled(body: FiniteElementBody) -> None:
         simulation.grip(top, 0.08 * simulation.extent_mm)
         at = simulation.last.positions[top]
         led = [at + part * np.array(way) for part in np.linspace(0.0, 1.0, steps + 1)[1:]]
-        seconds, own, left, failed = [], [], [], 0
+        seconds, own, left, frames, failed = [], [], [], [], 0
         for place in [*led, *[led[-1]] * 5, *[None] * 20]:
             if place is None:
                 simulation.release()
@@ -264,7 +264,9 @@ def pulled(body: FiniteElementBody) -> None:
                 simulation.pull(place)
             began, stepped, under_way = time.process_time(), time.thread_time(), True
             while under_way:
+                frames.append(time.thread_time())
                 frame = simulation.advance()
+                frames[-1] = 1e3 * (time.thread_time() - frames[-1])
                 failed += bool(frame.failed)
                 under_way = frame.under_way
             seconds.append(time.process_time() - began)
@@ -276,6 +278,7 @@ def pulled(body: FiniteElementBody) -> None:
             f"{np.array(seconds)[late].sum():.1f} s, median {1e3 * np.median(seconds):.0f} ms, worst {max(seconds):.2f} s; "
             f"of the thread that steps {sum(own):.1f} s, median {1e3 * np.median(own):.0f} ms, p90 {1e3 * np.quantile(own, 0.9):.0f}, "
             f"worst {max(own):.2f} s, above 17 ms {np.count_nonzero(np.array(own) > 0.017)}; "
+            f"{len(frames)} frames, p90 {np.quantile(frames, 0.9):.0f} ms, worst {max(frames):.0f}; "
             f"out of balance at most {100.0 * max(left):.0f} %, failed {failed}",
             flush=True,
         )

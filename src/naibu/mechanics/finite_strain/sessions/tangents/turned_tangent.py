@@ -1,7 +1,8 @@
 """Tangents of bodies that have turned since, in axes that turn with them, as in corotational methods :cite:p:`felippa2005`.
 
 A body that nothing holds turns as it is lifted, pulled or falls, and hardly changes its shape meanwhile. Its tangent turns with it: with
-that of a state from which it has turned by some degrees, iterations would follow the rotation little by little, or not at all.
+that of a state from which it has turned by some degrees, iterations would follow the rotation little by little, or not at all. Where parts
+of a body move apart, as a piece that a cut has freed, the rotation of the whole is that of none of them, and its tangent stays as it is.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from naibu.mechanics.linear_algebra.turned_factors import TurnedFactors
 from naibu.mechanics.linear_algebra.updated_factors import UpdatedFactors
 
 LEAST_TURN = 0.01  # rad, by which a tangent is turned, or turned anew
+MOSTLY = 0.5  # of a motion, translation aside: what a rotation may leave of it where the body turns, rather than changes its shape
 
 
 def rotation_to(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
@@ -37,7 +39,7 @@ class TurnedTangents:
     _rotation: FloatArray = field(init=False, default_factory=lambda: np.eye(3))
 
     def of(self, tangent: EarlierTangent, points: FloatArray, displacement: FloatArray) -> EarlierTangent:
-        """Return a tangent of a body that nothing holds, turned as the body has; that of another body as it is.
+        """Return a tangent of a body that nothing holds, turned as the body has; as it is where a rotation explains little of the motion.
 
         Parameters
         ----------
@@ -50,7 +52,10 @@ class TurnedTangents:
         """
         if len(tangent.held):
             return tangent
-        rotation = rotation_to(points + tangent.displacement, points + displacement)[0]
+        rotation, left = rotation_to(points + tangent.displacement, points + displacement)
+        motion = displacement - tangent.displacement
+        if left > MOSTLY * float(np.linalg.norm(motion - motion.mean(axis=0))):
+            return tangent
         if tangent is not self._of or self._turned is None:
             self._of, self._turned, self._rotation = tangent, tangent, np.eye(3)
         if _angle(rotation @ self._rotation.T) >= LEAST_TURN:
