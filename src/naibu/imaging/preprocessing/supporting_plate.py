@@ -1,0 +1,118 @@
+"""Plates that objects lie on in a scan, such as the couch under a patient, told from their shape alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from naibu.core.arrays import BoolArray, IntArray
+
+STEP = 2  # voxels: by which the outline of a curved plate goes up or down from column to column
+ALIKE = 1  # voxels: by how much the outline of a plate, and its thickness, may differ along the scan
+STEADY = 0.9  # share of the slices, and of the width, in which they are alike
+THICKEST = 0.25  # of the height of plate and object together: what is thicker is no plate
+WING, LEAST_WING = 0.04, 3  # of the width of the plate, and voxels, by which it stands out on either side of what it bears
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SupportingPlate:
+    """A plate under an object.
+
+    Attributes
+    ----------
+    voxels : ndarray, shape (nz, ny, nx), bool
+        The plate, with the layer of voxels above it, which show both.
+    wings : tuple of ndarray, shape (nz, ny, nx), bool
+        What of it stands out from under the object on either side.
+    """
+
+    voxels: BoolArray
+    wings: tuple[BoolArray, BoolArray]
+
+
+def supporting_plate(mask: BoolArray) -> SupportingPlate | None:
+    """Return the plate that an object lies on, if the mask of both shows one.
+
+    Parameters
+    ----------
+    mask : ndarray, shape (nz, ny, nx), bool
+        Object and plate.
+
+    Returns
+    -------
+    SupportingPlate or None
+        What has the same outline and thickness in all slices, is thin, lies under all of the object on one of the four sides of the
+        slices, and stands out on either side of it. None where nothing is of that kind.
+
+    Notes
+    -----
+    Where object and plate touch nothing need show their surface: the plate is as thick there as where it stands out, seen from below.
+    """
+    for axis in (1, 2):
+        for flip in (False, True):
+            # seen as (slices, across, height), from below
+            seen = mask.transpose(0, 3 - axis, axis)
+            seen = seen if flip else seen[:, :, ::-1]
+            found = _seen_from_below(seen)
+            if found is not None:
+                back = [(one if flip else one[:, :, ::-1]).transpose(*np.argsort((0, 3 - axis, axis))) & mask for one in found]
+                return SupportingPlate(back[0], (back[1], back[2]))
+    return None
+
+
+def _seen_from_below(seen: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray] | None:
+    """Return plate and wings (nz, across, height) of a mask whose last axis goes up, or None."""
+    filled = seen.any(axis=2)  # (nz, across)
+    slices = filled.any(axis=1)
+    if slices.sum() < LEAST_WING:
+        return None
+    bottom = np.where(filled, seen.argmax(axis=2), -1)
+    above = ~seen & (np.arange(seen.shape[2]) > bottom[..., None])
+    top = np.where(above.any(axis=2), above.argmax(axis=2), seen.shape[2])
+    steady, outline = _alike(bottom, filled, slices)
+    height = int(np.ptp(np.flatnonzero(seen.any(axis=(0, 1))))) + 1
+    flat, thickness = _alike(top - bottom, filled, slices)
+    middle = int(np.argmax(np.where(steady, thickness, -1)))
+    below = _reached(steady[1:] & steady[:-1] & (np.abs(np.diff(outline)) <= STEP), middle)
+    thick = np.ones(len(flat), dtype=bool)
+    thick[below] = ~flat[below] | (thickness[below] > THICKEST * height)
+    borne = _reached(thick[1:] & thick[:-1], middle)
+    if not thick[middle] or borne[0] == below[0] or borne[-1] == below[-1]:
+        return None
+    plain = ~thick[1:] & ~thick[:-1] & (np.abs(np.diff(thickness)) <= ALIKE)
+    sides = [np.intersect1d(_reached(plain, at), below) for at in (borne[0] - 1, borne[-1] + 1)]
+    sides = [sides[0][sides[0] < borne[0]], sides[1][sides[1] > borne[-1]]]
+    if min(map(len, sides)) < max(WING * len(below), LEAST_WING):
+        return None
+    thick_of = [float(np.median(thickness[side])) for side in sides]
+    if abs(thick_of[0] - thick_of[1]) > ALIKE:
+        return None
+    up = np.arange(seen.shape[2]) - outline[:, None]
+    plate = (up >= -ALIKE) & (up < max(thick_of) + 1)
+    return tuple(_in_slices(plate & _chosen(at, len(flat)), seen) for at in (below, *sides))  # type: ignore[return-value]
+
+
+def _reached(joined: BoolArray, start: int) -> IntArray:
+    """Return the columns that are joined to one without a gap; `joined` (n - 1,) tells which are to the next."""
+    gaps = np.flatnonzero(~joined)
+    left, right = gaps[gaps < start], gaps[gaps >= start]
+    return np.arange(left[-1] + 1 if len(left) else 0, (right[0] if len(right) else len(joined)) + 1)
+
+
+def _alike(values: IntArray, filled: BoolArray, slices: BoolArray) -> tuple[BoolArray, IntArray]:
+    """Return in which columns (across,) values (nz, across) are alike in nearly all slices, and their medians."""
+    shown = np.ma.masked_array(values, ~filled)
+    middle = np.ma.median(shown, axis=0).filled(-1).astype(np.int64)
+    same = filled & (np.abs(values - middle) <= ALIKE)
+    return same.sum(axis=0) >= STEADY * slices.sum(), middle
+
+
+def _chosen(at: IntArray, n: int) -> BoolArray:
+    chosen = np.zeros((n, 1), dtype=bool)
+    chosen[at] = True
+    return chosen
+
+
+def _in_slices(section: BoolArray, seen: BoolArray) -> BoolArray:
+    return np.asarray(np.broadcast_to(section, seen.shape))
