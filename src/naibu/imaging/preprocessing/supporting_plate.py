@@ -12,6 +12,7 @@ STEP = 2  # voxels: by which the outline of a curved plate goes up or down from 
 ALIKE = 1  # voxels: by how much the outline of a plate, and its thickness, may differ along the scan
 STEADY = 0.9  # share of the slices, and of the width, in which they are alike
 THICKEST = 0.25  # of the height of plate and object together: what is thicker is no plate
+MOST_OF_IT = 0.6  # of what stands out on one side, that has to be as thick
 WING, LEAST_WING = 0.04, 3  # of the width of the plate, and voxels, by which it stands out on either side of what it bears
 
 
@@ -63,8 +64,8 @@ def supporting_plate(mask: BoolArray) -> SupportingPlate | None:
 
 def _seen_from_below(seen: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray] | None:
     """Return plate and wings (nz, across, height) of a mask whose last axis goes up, or None."""
-    filled = seen.any(axis=2)  # (nz, across)
-    slices = filled.any(axis=1)
+    filled: BoolArray = np.logical_or.reduce(seen, axis=2)  # (nz, across)
+    slices: BoolArray = np.logical_or.reduce(filled, axis=1)
     if slices.sum() < LEAST_WING:
         return None
     bottom = np.where(filled, seen.argmax(axis=2), -1)
@@ -78,18 +79,17 @@ def _seen_from_below(seen: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray] 
     thick = np.ones(len(flat), dtype=bool)
     thick[below] = ~flat[below] | (thickness[below] > THICKEST * height)
     borne = _reached(thick[1:] & thick[:-1], middle)
-    if not thick[middle] or borne[0] == below[0] or borne[-1] == below[-1]:
+    if not thick[middle] or borne[0] <= below[0] or borne[-1] >= below[-1]:
         return None
-    plain = ~thick[1:] & ~thick[:-1] & (np.abs(np.diff(thickness)) <= ALIKE)
-    sides = [np.intersect1d(_reached(plain, at), below) for at in (borne[0] - 1, borne[-1] + 1)]
-    sides = [sides[0][sides[0] < borne[0]], sides[1][sides[1] > borne[-1]]]
-    if min(map(len, sides)) < max(WING * len(below), LEAST_WING):
-        return None
-    thick_of = [float(np.median(thickness[side])) for side in sides]
-    if abs(thick_of[0] - thick_of[1]) > ALIKE:
-        return None
+    sides, thickest = [], 0.0
+    for columns in (below[below < borne[0]], below[below > borne[-1]]):
+        own = float(np.median(thickness[columns]))
+        sides.append(columns[~thick[columns] & (np.abs(thickness[columns] - own) <= ALIKE)])
+        if len(sides[-1]) < max(WING * len(below), LEAST_WING, MOST_OF_IT * len(columns)) or (thickest and abs(own - thickest) > ALIKE):
+            return None
+        thickest = max(thickest, own)
     up = np.arange(seen.shape[2]) - outline[:, None]
-    plate = (up >= -ALIKE) & (up < max(thick_of) + 1)
+    plate = (up >= -ALIKE) & (up < thickest + 1)
     return tuple(_in_slices(plate & _chosen(at, len(flat)), seen) for at in (below, *sides))  # type: ignore[return-value]
 
 
@@ -102,8 +102,9 @@ def _reached(joined: BoolArray, start: int) -> IntArray:
 
 def _alike(values: IntArray, filled: BoolArray, slices: BoolArray) -> tuple[BoolArray, IntArray]:
     """Return in which columns (across,) values (nz, across) are alike in nearly all slices, and their medians."""
-    shown = np.ma.masked_array(values, ~filled)
-    middle = np.ma.median(shown, axis=0).filled(-1).astype(np.int64)
+    middle = np.full(values.shape[1], -1, dtype=np.int64)
+    for column in np.flatnonzero(np.logical_or.reduce(filled, axis=0)):
+        middle[column] = int(np.median(values[filled[:, column], column]))
     same = filled & (np.abs(values - middle) <= ALIKE)
     return same.sum(axis=0) >= STEADY * slices.sum(), middle
 

@@ -12,7 +12,7 @@ from naibu.core.arrays import BoolArray
 from naibu.core.errors import InputError
 from naibu.core.progress import Progress
 from naibu.core.volume import Volume
-from naibu.imaging.preprocessing.field_of_view import fields_of_view, in_box
+from naibu.imaging.preprocessing.field_of_view import Box, fields_of_view, in_box
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.supporting_plate import supporting_plate
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
@@ -43,23 +43,23 @@ def without_plate(
     Returns
     -------
     tuple of (ndarray of shape (nz, ny, nx), CorrelationResult), or None
-        Voxels of the object alone, and its displacement; None without a plate that is at rest in both volumes, where nothing moves on it, and where the own field of the object rests, too,
-        where both meet.
+        Voxels of the object alone, and its displacement; None without a plate that is at rest in both volumes, where nothing moves on it,
+        and where the own field of the object rests, too, where both meet.
     """
     plate = supporting_plate(inside)
     if plate is None:
         return None
-    alone = inside & ~plate.voxels
+    views = fields_of_view(reference, deformed)
+    alone = _alone(reference, inside, plate.voxels, views[0])
     voxel = float(np.prod(reference.spacing_mm)) ** (1.0 / 3.0)
     moved = np.linalg.norm(whole.displacement.vectors[alone & whole.valid][:, :2], axis=1)
     if not len(moved) or (moved > MOVED * voxel).mean() < MOVING:
         return None
-    views = fields_of_view(reference, deformed)
     there = mask_in_view(deformed, views[1])
     plate_there = supporting_plate(there)
     if plate_there is None or _shared(plate.voxels, plate_there.voxels) < AT_REST:
         return None
-    there &= ~plate_there.voxels
+    there = _alone(deformed, there, plate_there.voxels, views[1])
     # the surface has much of the contrast
     compared = ndimage.binary_dilation(alone, mask=in_box(views[0], reference.shape) & ~plate.voxels)
     try:
@@ -67,6 +67,15 @@ def without_plate(
     except InputError:
         return None  # the field of both stands
     return (alone, own) if _slides(own, alone, plate.voxels, MOVED * voxel) else None
+
+
+def _alone(volume: Volume, inside: BoolArray, plate: BoolArray, view: Box) -> BoolArray:
+    """Return the object as it is found where air takes the place of its plate: the outline of both closes narrow gaps between them."""
+    outside = in_box(view, volume.shape) & ~inside
+    if not outside.any():
+        return inside & ~plate
+    alone = volume.with_values(np.where(plate, np.median(volume.values[outside]), volume.values))
+    return mask_in_view(alone, view) & inside & ~plate
 
 
 def _shared(one: BoolArray, other: BoolArray) -> float:
