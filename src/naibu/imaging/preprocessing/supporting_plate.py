@@ -2,37 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from naibu.core.arrays import BoolArray, IntArray
 
 STEP = 2  # voxels: by which the outline of a curved plate goes up or down from column to column
 ALIKE = 1  # voxels: by how much the outline of a plate, and its thickness, may differ along the scan
-STEADY = 0.9  # share of the slices, and of the width, in which they are alike
+STEADY = 0.9  # share of the slices in which they are alike
 THICKEST = 0.25  # of the height of plate and object together: what is thicker is no plate
 MOST_OF_IT = 0.6  # of what stands out on one side, that has to be as thick
 WING, LEAST_WING = 0.04, 3  # of the width of the plate, and voxels, by which it stands out on either side of what it bears
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SupportingPlate:
-    """A plate under an object.
-
-    Attributes
-    ----------
-    voxels : ndarray, shape (nz, ny, nx), bool
-        The plate, with the layer of voxels above it, which show both.
-    wings : tuple of ndarray, shape (nz, ny, nx), bool
-        What of it stands out from under the object on either side.
-    """
-
-    voxels: BoolArray
-    wings: tuple[BoolArray, BoolArray]
-
-
-def supporting_plate(mask: BoolArray) -> SupportingPlate | None:
+def supporting_plate(mask: BoolArray) -> BoolArray | None:
     """Return the plate that an object lies on, if the mask of both shows one.
 
     Parameters
@@ -42,9 +24,9 @@ def supporting_plate(mask: BoolArray) -> SupportingPlate | None:
 
     Returns
     -------
-    SupportingPlate or None
-        What has the same outline and thickness in all slices, is thin, lies under all of the object on one of the four sides of the
-        slices, and stands out on either side of it. None where nothing is of that kind.
+    ndarray of shape (nz, ny, nx), bool, or None
+        The plate, with the layer of voxels above it, which show both: what has the same outline and thickness in all slices, is thin, lies
+        under the object on one of the four sides of the slices, and stands out on either side of where it bears it. None where nothing is so.
 
     Notes
     -----
@@ -57,13 +39,12 @@ def supporting_plate(mask: BoolArray) -> SupportingPlate | None:
             seen = seen if flip else seen[:, :, ::-1]
             found = _seen_from_below(seen)
             if found is not None:
-                back = [(one if flip else one[:, :, ::-1]).transpose(*np.argsort((0, 3 - axis, axis))) & mask for one in found]
-                return SupportingPlate(back[0], (back[1], back[2]))
+                return (found if flip else found[:, :, ::-1]).transpose(*np.argsort((0, 3 - axis, axis))) & mask
     return None
 
 
-def _seen_from_below(seen: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray] | None:
-    """Return plate and wings (nz, across, height) of a mask whose last axis goes up, or None."""
+def _seen_from_below(seen: BoolArray) -> BoolArray | None:
+    """Return the plate (nz, across, height) of a mask whose last axis goes up, or None."""
     filled: BoolArray = np.logical_or.reduce(seen, axis=2)  # (nz, across)
     slices: BoolArray = np.logical_or.reduce(filled, axis=1)
     if slices.sum() < LEAST_WING:
@@ -81,16 +62,17 @@ def _seen_from_below(seen: BoolArray) -> tuple[BoolArray, BoolArray, BoolArray] 
     borne = _reached(thick[1:] & thick[:-1], middle)
     if not thick[middle] or borne[0] <= below[0] or borne[-1] >= below[-1]:
         return None
-    sides, thickest = [], 0.0
+    thickest = 0.0
     for columns in (below[below < borne[0]], below[below > borne[-1]]):
         own = float(np.median(thickness[columns]))
-        sides.append(columns[~thick[columns] & (np.abs(thickness[columns] - own) <= ALIKE)])
-        if len(sides[-1]) < max(WING * len(below), LEAST_WING, MOST_OF_IT * len(columns)) or (thickest and abs(own - thickest) > ALIKE):
+        plain = int((~thick[columns] & (np.abs(thickness[columns] - own) <= ALIKE)).sum())
+        if plain < max(WING * len(below), LEAST_WING, MOST_OF_IT * len(columns)) or (thickest and abs(own - thickest) > ALIKE):
             return None
         thickest = max(thickest, own)
     up = np.arange(seen.shape[2]) - outline[:, None]
     plate = (up >= -ALIKE) & (up < thickest + 1)
-    return tuple(_in_slices(plate & _chosen(at, len(flat)), seen) for at in (below, *sides))  # type: ignore[return-value]
+    plate[: below[0]] = plate[below[-1] + 1 :] = False
+    return np.asarray(np.broadcast_to(plate, seen.shape))
 
 
 def _reached(joined: BoolArray, start: int) -> IntArray:
@@ -107,13 +89,3 @@ def _alike(values: IntArray, filled: BoolArray, slices: BoolArray) -> tuple[Bool
         middle[column] = int(np.median(values[filled[:, column], column]))
     same = filled & (np.abs(values - middle) <= ALIKE)
     return same.sum(axis=0) >= STEADY * slices.sum(), middle
-
-
-def _chosen(at: IntArray, n: int) -> BoolArray:
-    chosen = np.zeros((n, 1), dtype=bool)
-    chosen[at] = True
-    return chosen
-
-
-def _in_slices(section: BoolArray, seen: BoolArray) -> BoolArray:
-    return np.asarray(np.broadcast_to(section, seen.shape))

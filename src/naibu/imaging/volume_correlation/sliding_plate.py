@@ -50,23 +50,23 @@ def without_plate(
     if plate is None:
         return None
     views = fields_of_view(reference, deformed)
-    alone = _alone(reference, inside, plate.voxels, views[0])
+    alone = _alone(reference, inside, plate, views[0])
     voxel = float(np.prod(reference.spacing_mm)) ** (1.0 / 3.0)
     moved = np.linalg.norm(whole.displacement.vectors[alone & whole.valid][:, :2], axis=1)
     if not len(moved) or (moved > MOVED * voxel).mean() < MOVING:
         return None
     there = mask_in_view(deformed, views[1])
     plate_there = supporting_plate(there)
-    if plate_there is None or _shared(plate.voxels, plate_there.voxels) < AT_REST:
+    if plate_there is None or _shared(plate, plate_there) < AT_REST:
         return None
-    there = _alone(deformed, there, plate_there.voxels, views[1])
+    there = _alone(deformed, there, plate_there, views[1])
     # the surface has much of the contrast
-    compared = ndimage.binary_dilation(alone, mask=in_box(views[0], reference.shape) & ~plate.voxels)
+    compared = ndimage.binary_dilation(alone, mask=in_box(views[0], reference.shape) & ~plate)
     try:
         own = correlate_volumes(reference, deformed, mask=compared, deformed_mask=there, progress=progress)
     except InputError:
         return None  # the field of both stands
-    return (alone, own) if _slides(own, alone, plate.voxels, MOVED * voxel) else None
+    return (alone, own) if _slides(own, alone, plate, MOVED * voxel) else None
 
 
 def _alone(volume: Volume, inside: BoolArray, plate: BoolArray, view: Box) -> BoolArray:
