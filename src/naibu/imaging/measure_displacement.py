@@ -39,6 +39,7 @@ from naibu.imaging.volume_correlation.correlate import correlate_volumes
 from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts, doubt_beside
 from naibu.imaging.volume_correlation.results.block_displacements import LEFT
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
+from naibu.imaging.volume_correlation.sliding_plate import without_plate
 
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
 METHODS: tuple[Method, ...] = get_args(Method)
@@ -168,7 +169,7 @@ def measure_displacement(
         inside, doubts = require_mask(mask, reference), ()
         compared = inside
     if method == "default":
-        found = _correlated(reference, deformed, inside, (compared, deformed_mask), progress)
+        found = _correlated(reference, deformed, inside, (compared, deformed_mask), progress, given=mask is not None)
     else:
         found = _by_classic_method(reference, deformed, method, inside, progress)
     return replace(found, warnings=doubts + found.warnings, facts=found.facts | facts)
@@ -303,8 +304,22 @@ def _correlated(
     inside: BoolArray,
     masks: tuple[BoolArray, ArrayLike | None],
     progress: Progress | None,
+    *,
+    given: bool,
 ) -> MeasuredDisplacement:
     found = correlate_volumes(reference, deformed, mask=masks[0], deformed_mask=masks[1], progress=progress)
+    alone = None if given else without_plate(reference, deformed, inside, found, progress)
+    if alone is None:
+        return _by_parts(reference, deformed, inside, found, progress)
+    measured = _by_parts(reference, deformed, *alone, progress)
+    told = f"The object slides on a plate, {100.0 * (1.0 - alone[0].sum() / inside.sum()):.0f} % of the mask that was found, as a patient "
+    told += "does on a couch: the plate is left out, and not answered. If it belongs to the object, give a `mask`."
+    return replace(measured, warnings=(told, *measured.warnings))
+
+
+def _by_parts(
+    reference: Volume, deformed: Volume, inside: BoolArray, found: CorrelationResult, progress: Progress | None
+) -> MeasuredDisplacement:
     parts = correlated_parts(reference, deformed, inside, found, progress=progress)
     if not parts:
         return measured_by(found, reference, inside, reuse=True)
