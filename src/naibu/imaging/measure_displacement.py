@@ -168,8 +168,9 @@ def measure_displacement(
     else:
         inside, doubts = require_mask(mask, reference), ()
         compared = inside
+    given = mask is not None or deformed_mask is not None
     if method == "default":
-        found = _correlated(reference, deformed, inside, (compared, deformed_mask), progress, given=mask is not None or deformed_mask is not None)
+        found = _correlated(reference, deformed, inside, (compared, deformed_mask), progress, given=given)
     else:
         found = _by_classic_method(reference, deformed, method, inside, progress)
     return replace(found, warnings=doubts + found.warnings, facts=found.facts | facts)
