@@ -136,7 +136,7 @@ def measure_displacement(
         differences or normalised cross-correlation; ``"horn-schunck"``, ``"lucas-kanade"`` are optical flow; ``"hybrid"`` combines block
         matching and optical flow as the report does; ``"rigid"`` is the rigid motion of the whole object.
     mask : array_like, shape (nz, ny, nx), optional
-        Voxels of the object in the reference; by default from `naibu.imaging.object_mask`.
+        Voxels of the object in the reference; by default from `naibu.imaging.object_mask`, without a plate that the object slides on.
     deformed_mask : array_like, shape (nz, ny, nx), optional
         Voxels of the object in the deformed volume, for digital volume correlation; the classic methods do not use it.
     progress : Progress, optional
@@ -168,8 +168,9 @@ def measure_displacement(
     else:
         inside, doubts = require_mask(mask, reference), ()
         compared = inside
+    given = mask is not None or deformed_mask is not None
     if method == "default":
-        found = _correlated(reference, deformed, inside, (compared, deformed_mask), progress, given=mask is not None)
+        found = _correlated(reference, deformed, inside, (compared, deformed_mask), progress, given=given)
     else:
         found = _by_classic_method(reference, deformed, method, inside, progress)
     return replace(found, warnings=doubts + found.warnings, facts=found.facts | facts)

@@ -26,8 +26,7 @@ def supporting_plate(mask: BoolArray) -> BoolArray | None:
     -------
     ndarray of shape (nz, ny, nx), bool, or None
         The plate, with the layer of voxels above it, which show both: what has the same outline and thickness in all slices, is thin, lies
-        under the object on one of the four sides of the slices, and stands out on either side of where it bears it. None where nothing is
-        so.
+        under the object on one of the four sides of the slices, and stands out on either side of where it bears it; or None.
 
     Notes
     -----
