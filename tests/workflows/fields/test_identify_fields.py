@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -29,7 +30,7 @@ from naibu.io.images import read_volume, write_volume
 from naibu.validation.specimens.quadratic_body import UNKNOWN, QuadraticBody, Solved
 from naibu.workflows.fields import cells_of_map
 from naibu.workflows.fields.block_mesh import block_mesh, blurred, misplaced, moved_borders, sizes_of_voxels
-from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields, table_of_assumptions
+from naibu.workflows.fields.identify_fields import FieldIdentification, identify_fields, table_of_assumptions, table_of_zones
 from naibu.workflows.fields.known_zones import parse_known_zones
 from naibu.workflows.fields.object_on_cubes import ScannedObject
 
@@ -473,3 +474,17 @@ def test_what_leaves_nothing_to_be_identified_is_refused_and_leaves_no_folder(
     with pytest.raises(InputError, match=told):
         identify_fields(folder / "field.h5", mask=folder / "labels.mha", known=known, each_cell=each_cell, out=folder / "nothing")
     assert not (folder / "nothing").exists()
+
+
+@pytest.mark.parametrize(("high", "told"), [(20.0, "roughly determined"), (np.inf, "not determined")])
+def test_a_modulus_without_an_upper_bound_is_not_determined_in_the_table_either(high: float, told: str) -> None:
+    """Its standard deviation may be small all the same: errors of elements near incompressibility had one of 0.26."""
+    bounds = np.array([[8.0, high]]), np.array([[-1.0, 0.5]])
+    uncertainty = SimpleNamespace(of_young_and_poisson=lambda theta: np.array([[0.26], [0.1]]))
+    estimate: Any = SimpleNamespace(
+        uncertainty=uncertainty, verdict=None, theta=np.zeros(2), identifiability=(), zones=SimpleNamespace(names=("soft",)),
+        intervals=lambda law_exact=False: bounds, young_modulus=np.array([12.0]), poisson_ratio=np.array([0.45]),
+    )  # fmt: skip
+    result: Any = SimpleNamespace(estimate=estimate, unit="kPa", left_out=())
+    table = table_of_zones(result)
+    assert table.rows[0][table.columns.index("Young's modulus is")] == told

@@ -320,7 +320,8 @@ def _grades(found: FieldEstimate, uncertainty: Uncertainty) -> list[str]:
     judged = found.verdict
     usable, apart = judged is None or judged.ok, () if judged is None else judged.mesh_dependent
     sure = (judged is None or judged.explanation is Explanation.EXPLAINED) and TOO_COARSE not in found.identifiability
-    sd = uncertainty.of_young_and_poisson(found.theta)[0]
+    bounded = np.isfinite(found.intervals()[0][:, 1])  # a modulus without an upper bound is not determined, whatever its curvature
+    sd = np.where(bounded | (not usable), uncertainty.of_young_and_poisson(found.theta)[0], np.inf)
     return [grade(s, usable=usable, sure=sure, apart=n in apart) for s, n in zip(sd, found.zones.names, strict=True)]
 
 
