@@ -164,6 +164,8 @@ def registration(points: FloatArray, measured: FloatArray) -> RigidTransform:
     seen = np.isfinite(measured)
     whole = seen.all(axis=1)
     transform = _kabsch(points[whole], measured[whole])
+    if whole.all():
+        return transform
     some = seen.any(axis=1)
     for _ in range(FILLING_STEPS):
         filled = np.where(seen, measured, transform.applied(points))

@@ -36,10 +36,10 @@ from naibu.imaging.preprocessing.resampling import require_mask, resampled_to_gr
 from naibu.imaging.preprocessing.rigid_registration import rigid_from_points, total_displacement
 from naibu.imaging.preprocessing.volume_pair import require_known, require_one_grid
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
-from naibu.imaging.volume_correlation.part_by_part import APART, correlated_parts, doubt_beside
 from naibu.imaging.volume_correlation.results.block_displacements import LEFT
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
-from naibu.imaging.volume_correlation.sliding_plate import without_plate
+from naibu.imaging.volume_correlation.sliding.part_by_part import APART, correlated_parts, doubt_beside
+from naibu.imaging.volume_correlation.sliding.sliding_plate import without_plate
 
 Method = Literal["default", "features", "sad-blocks", "ssd-blocks", "ncc-blocks", "horn-schunck", "lucas-kanade", "hybrid", "rigid"]
 METHODS: tuple[Method, ...] = get_args(Method)

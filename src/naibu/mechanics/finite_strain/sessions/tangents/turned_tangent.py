@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from naibu.core.arrays import FloatArray
+from naibu.core.rigid_transform import registration
 from naibu.mechanics.finite_strain.sessions.tangents.earlier_tangent import EarlierTangent
 from naibu.mechanics.linear_algebra.paired_motion import PairedMotion
 from naibu.mechanics.linear_algebra.turned_factors import TurnedFactors
@@ -23,11 +24,8 @@ MOSTLY = 0.5  # of a motion, translation aside: what a rotation may leave of it 
 
 def rotation_to(before: FloatArray, after: FloatArray) -> tuple[FloatArray, float]:
     """Return the rotation (3, 3) that leads positions (n, 3), mm, to others best, and the root of the sum of the squares left, mm."""
-    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
-    u, sizes, vt = np.linalg.svd(b.T @ a)
-    sign = float(np.sign(np.linalg.det(u @ vt)))
-    left = float((a * a).sum() + (b * b).sum()) - 2.0 * float(sizes[0] + sizes[1] + sign * sizes[2])
-    return np.asarray((u * [1.0, 1.0, sign]) @ vt), float(np.sqrt(max(left, 0.0)))
+    best = registration(before, after)
+    return best.rotation, float(np.linalg.norm(after - best.applied(before)))
 
 
 @dataclass(slots=True, eq=False)

@@ -20,14 +20,14 @@ from naibu.imaging.measure_displacement import measure_displacement
 from naibu.imaging.preprocessing.intensity_parts import intensity_parts
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
-from naibu.imaging.volume_correlation.part_by_part import (
+from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
+from naibu.imaging.volume_correlation.sliding.part_by_part import (
     correlated_parts,
     doubt_beside,
     jump_fraction,
     with_own_field,
     without_what_slides,
 )
-from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
 from naibu.validation.scanners.textures import Texture
 
 SHAPE, SPACING_MM, SLIDE_MM = (44, 52, 60), (1.0, 1.0, 1.0), 6.0
@@ -188,7 +188,7 @@ def test_what_may_still_be_what_slides_within_a_part_is_not_answered(monkeypatch
         misplacement_at=lambda at: np.where(at[:, 0] > MIDDLE_MM[0], 16.0, 0.0),
     )
     stiff = replace(rest, bending=np.full_like(rest.bending, 9.0))
-    module = importlib.import_module("naibu.imaging.volume_correlation.part_by_part")
+    module = importlib.import_module("naibu.imaging.volume_correlation.sliding.part_by_part")
     monkeypatch.setattr(module, "correlate_volumes", lambda *_, **__: stiff)
     answered = without_what_slides(before, after, ball, found)
     beside = x[..., 0] - MIDDLE_MM[0]
@@ -264,7 +264,7 @@ def test_a_field_that_has_lost_its_way_is_no_witness_of_a_slide(monkeypatch: pyt
     left = {"apart_fraction": lambda _: 0.02, "misplaced_fraction": 0.0, "misplacement_at": lambda at: np.full(len(at), 1e-4)}
     whole: Any = SimpleNamespace(volume=before, **left)
     assert jump_fraction(own[0], (own[1][0], lost)) > 0.9
-    module = importlib.import_module("naibu.imaging.volume_correlation.part_by_part")
+    module = importlib.import_module("naibu.imaging.volume_correlation.sliding.part_by_part")
     fields = iter((own[0][1], lost))
     monkeypatch.setattr(module, "correlate_volumes", lambda *_, **__: next(fields))
     assert correlated_parts(before, after, ball, whole) == ()
@@ -277,7 +277,7 @@ def test_fields_of_parts_that_leave_less_than_half_a_voxel_are_not_lost(monkeypa
     fields = iter([replace(f, cell_misplacement=np.where(np.isfinite(f.cell_misplacement), 0.16, np.nan)) for _, f in own])
     left = {"apart_fraction": lambda _: 0.02, "misplaced_fraction": 0.01, "misplacement_at": lambda at: np.full(len(at), 1e-4)}
     whole: Any = SimpleNamespace(volume=before, **left)
-    module = importlib.import_module("naibu.imaging.volume_correlation.part_by_part")
+    module = importlib.import_module("naibu.imaging.volume_correlation.sliding.part_by_part")
     monkeypatch.setattr(module, "correlate_volumes", lambda *_, **__: next(fields))
     assert len(correlated_parts(before, after, ball, whole)) == 2
 

@@ -16,8 +16,8 @@ from naibu.imaging.preprocessing.field_of_view import Box, fields_of_view, in_bo
 from naibu.imaging.preprocessing.object_mask import mask_in_view
 from naibu.imaging.preprocessing.supporting_plate import supporting_plate
 from naibu.imaging.volume_correlation.correlate import correlate_volumes
-from naibu.imaging.volume_correlation.part_by_part import JUMPING
 from naibu.imaging.volume_correlation.results.correlation_result import CorrelationResult
+from naibu.imaging.volume_correlation.sliding.part_by_part import JUMPING
 
 MOVED, MOVING = 1.0, 0.05  # voxels that an object has to move on its plate, and in which share of it, for a slide to be looked for
 AT_REST = 0.9  # overlap of a plate in both scans, above which it is at rest

@@ -15,7 +15,7 @@ from naibu.imaging.measure_displacement import measure_displacement
 from naibu.imaging.preprocessing.object_mask import object_mask
 from naibu.imaging.preprocessing.resampling import positions
 from naibu.imaging.preprocessing.supporting_plate import supporting_plate
-from naibu.imaging.volume_correlation.sliding_plate import without_plate
+from naibu.imaging.volume_correlation.sliding.sliding_plate import without_plate
 from naibu.validation.scanners.textures import Texture
 
 SHAPE = (10, 46, 84)
@@ -123,5 +123,5 @@ def test_nothing_is_looked_for_where_nothing_moves_or_no_plate_is(plate: bool, m
     before, after, _, truth = scans(still if plate else rolled, plate=plate)
     inside = object_mask(before)
     assert (supporting_plate(inside) is not None) == plate
-    monkeypatch.delattr("naibu.imaging.volume_correlation.sliding_plate.correlate_volumes")
+    monkeypatch.delattr("naibu.imaging.volume_correlation.sliding.sliding_plate.correlate_volumes")
     assert without_plate(before, after, inside, one_field(inside, truth)) is None
